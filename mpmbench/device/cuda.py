@@ -1,0 +1,267 @@
+"""The ``cuda`` device: CuPy compiles and launches the kernels, CUDA events time them.
+
+The only file that imports CuPy, and only once a device is opened: the package works without it. It stays thin,
+because every line here runs on a GPU alone; what can be decided elsewhere (sampling, checks) is decided elsewhere.
+
+All work goes to one non-default stream of the device, so that nothing of the legacy default stream can end up
+between two events.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from mpmbench.device import CompiledKernel, KernelInfo, Launch, LaunchReport
+from mpmbench.errors import InputError
+from mpmbench.kernel import COMPILE_OPTIONS, KernelSource
+
+DEFAULT_SHARED_BYTES = 48 * 1024  # a kernel that wants more dynamic shared memory has to ask for it
+CURE_KERNEL = "run it on the device 'simulated' in its debug mode to find the cause; this process has lost the GPU"
+CURE_LAUNCH = "use another block shape or fewer threads per thread block"
+CURE_NO_GPU = "run on a machine with an NVIDIA GPU and driver, or use the device 'simulated'"
+
+# Options that CuPy appends to every compile, beside the architecture; given twice they only make its cache key differ.
+CUPY_APPENDS = ("-ftz=true", "-default-device")
+
+# Keeps the stream busy for a while. Python needs some 10 us per launch; without this the gap between the start event
+# and the kernel would be timed as well. The cycle count ends the loop should the global timer stand still: no GPU
+# clock exceeds 4 GHz.
+HOLD_SOURCE = r"""
+extern "C" __global__ void mpmbench_hold(unsigned long long nanoseconds)
+{
+    const long long first_cycle = clock64();
+    unsigned long long begin, now;
+    asm volatile("mov.u64 %0, %%globaltimer;" : "=l"(begin));
+    do {
+        asm volatile("mov.u64 %0, %%globaltimer;" : "=l"(now));
+    } while (now - begin < nanoseconds
+             && (unsigned long long)(clock64() - first_cycle) < 4 * nanoseconds);
+}
+"""
+
+
+def import_cupy() -> ModuleType:
+    """CuPy, or an InputError that says how to install it."""
+    try:
+        import cupy
+    except ImportError as error:
+        raise InputError(
+            "the device 'cuda' needs CuPy, which cannot be imported "
+            f"({_one_line(error)}): pip install 'mpmbench[cuda12x]' for a CUDA 12 driver, 'mpmbench[cuda13x]' for 13"
+        ) from error
+    return cupy
+
+
+def cupy_options(options: tuple[str, ...]) -> tuple[str, ...]:
+    """Our NVRTC options without those that CuPy adds by itself."""
+    return tuple(option for option in options if option not in CUPY_APPENDS)
+
+
+class CudaDevice:
+    """One GPU. ``name`` is "cuda" (the first GPU) or "cuda:N"; it is "cuda:N" afterwards.
+
+    Besides the device protocol it offers what ``measure`` needs: ``flush_cache``, ``hold``, ``record``, ``elapsed``.
+    """
+
+    def __init__(self, name: str = "cuda") -> None:
+        index = _device_index(name)
+        self._cupy = import_cupy()
+        cuda = self._cupy.cuda
+        self._cuda_errors = (cuda.runtime.CUDARuntimeError, cuda.driver.CUDADriverError)
+        try:
+            count = cuda.runtime.getDeviceCount()
+        except self._cuda_errors as error:
+            raise InputError(f"no GPU for device {name!r} ({_one_line(error)}): {CURE_NO_GPU}") from error
+        if count == 0:
+            raise InputError(f"no GPU for device {name!r}: {CURE_NO_GPU}")
+        if index >= count:
+            last = count - 1
+            raise InputError(f"no GPU {index} for device {name!r}: this machine has cuda:0 to cuda:{last}")
+        self.name = f"cuda:{index}"
+        self._gpu = cuda.Device(index)
+        with self._errors("cannot use the GPU"), self._gpu:
+            self.properties: dict[str, Any] = cuda.runtime.getDeviceProperties(index)
+            self.arch = f"sm_{self._gpu.compute_capability}"
+            self._stream = cuda.Stream(non_blocking=True)
+        self._hold_kernel: Any = None
+        self._flush_buffer: Any = None
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What records keep of this GPU and of what runs on it."""
+        cuda, properties = self._cupy.cuda, self.properties
+        name, uuid = properties["name"], properties.get("uuid")
+        with self._errors("cannot ask for versions"):
+            return {
+                "name": name.decode() if isinstance(name, bytes) else str(name),
+                "uuid": uuid.hex() if isinstance(uuid, bytes) else None,
+                "arch": self.arch,
+                "multiprocessors": properties["multiProcessorCount"],
+                "memory_bytes": properties["totalGlobalMem"],
+                "l2_bytes": properties["l2CacheSize"],
+                "clock_khz": properties["clockRate"],
+                "memory_clock_khz": properties["memoryClockRate"],
+                "memory_bus_bits": properties["memoryBusWidth"],
+                "ecc": bool(properties["ECCEnabled"]),
+                "cuda_driver": cuda.runtime.driverGetVersion(),
+                "nvrtc": ".".join(map(str, cuda.nvrtc.getVersion())),
+                "cupy": self._cupy.__version__,
+            }
+
+    # Memory
+
+    @property
+    def free_bytes(self) -> int:
+        """Device memory that is free now [bytes]."""
+        with self._errors("cannot ask for the free memory"):
+            free, _total = self._gpu.mem_info
+        return int(free)
+
+    def upload(self, host: np.ndarray) -> Any:
+        with self._allocating(host.nbytes):
+            # A copy of pageable memory may still be under way when a non-blocking call returns.
+            return self._cupy.asarray(np.ascontiguousarray(host), blocking=True)
+
+    def empty(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
+        with self._allocating(int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize):
+            return self._cupy.empty(shape, dtype=dtype)
+
+    def download(self, array: Any) -> np.ndarray:
+        with self._errors("a kernel launched before has failed", CURE_KERNEL), self._current():
+            return self._cupy.asnumpy(array, blocking=True)
+
+    # Kernels
+
+    def compile(self, source: KernelSource, entry: str) -> CompiledKernel:
+        compile_error = self._cupy.cuda.compiler.CompileException
+        try:
+            with self._errors(f"cannot load kernel {entry} of {source.name}"), self._current():
+                module = self._cupy.RawModule(code=source.text, options=cupy_options(COMPILE_OPTIONS))
+                kernel = module.get_function(entry)
+                kernel.compile()  # lazily it would land in the first sample
+        except compile_error as error:
+            raise InputError(f"{source.name} does not compile for {self.arch}: {_first_error(str(error))}") from error
+        return CompiledKernel(source, entry, kernel)
+
+    def info(self, kernel: CompiledKernel) -> KernelInfo:
+        """What the driver says of the loaded kernel. It counts spills as local memory, so ``spill_bytes`` is None."""
+        with self._errors(f"cannot ask for the attributes of {kernel.entry}"), self._current():
+            attributes = kernel.handle.attributes
+        return KernelInfo(
+            arch=self.arch,
+            registers=attributes["num_regs"],
+            shared_bytes=attributes["shared_size_bytes"],
+            local_bytes=attributes["local_size_bytes"],
+        )
+
+    def launch(self, launch: Launch) -> LaunchReport:
+        # CuPy would turn an empty grid into one thread block.
+        if 0 in launch.grid or 0 in launch.block:
+            return LaunchReport()
+        failure = f"kernel {launch.name} cannot be launched ({_geometry(launch)})"
+        with self._errors(failure, CURE_LAUNCH), self._current():
+            if launch.shared_bytes > DEFAULT_SHARED_BYTES:
+                self._allow_shared(launch)
+            launch.kernel.handle(
+                launch.grid, launch.block, tuple(map(_argument, launch.args)), shared_mem=launch.shared_bytes
+            )
+        return LaunchReport()
+
+    def synchronize(self) -> None:
+        with self._errors("a kernel launched before has failed", CURE_KERNEL):
+            self._stream.synchronize()
+
+    # Timing
+
+    def flush_cache(self) -> None:
+        """Evict the second-level cache: overwrite a buffer of twice its size, on the stream."""
+        size = 2 * int(self.properties["l2CacheSize"])
+        if self._flush_buffer is None:
+            self._flush_buffer = self.empty(size, np.uint8)
+        with self._errors("cannot flush the cache"):
+            self._flush_buffer.data.memset_async(0, size, stream=self._stream)
+
+    def hold(self, seconds: float) -> None:
+        """Keep the stream busy for about ``seconds`` while the host enqueues what comes next."""
+        with self._errors("cannot hold the stream"), self._current():
+            if self._hold_kernel is None:
+                module = self._cupy.RawModule(code=HOLD_SOURCE, options=cupy_options(COMPILE_OPTIONS))
+                self._hold_kernel = module.get_function("mpmbench_hold")
+            self._hold_kernel((1, 1, 1), (1, 1, 1), (np.uint64(round(seconds * 1e9)),), shared_mem=0)
+
+    def record(self) -> Any:
+        """A new event at this point of the stream."""
+        with self._errors("cannot record an event"), self._current():
+            return self._stream.record(self._cupy.cuda.Event())
+
+    def elapsed(self, start: Any, end: Any) -> float:
+        """Time between two events [s]; both must have happened."""
+        with self._errors("cannot read the time between two events"):
+            return self._cupy.cuda.get_elapsed_time(start, end) * 1e-3
+
+    # Helpers
+
+    @contextmanager
+    def _current(self) -> Iterator[None]:
+        with self._gpu, self._stream:
+            yield
+
+    @contextmanager
+    def _errors(self, what: str, cure: str = "see `mpmbench doctor`") -> Iterator[None]:
+        try:
+            yield
+        except self._cuda_errors as error:
+            raise InputError(f"{self.name}: {what}: {_one_line(error)}; {cure}") from error
+
+    @contextmanager
+    def _allocating(self, size: int) -> Iterator[None]:
+        try:
+            with self._errors(f"cannot allocate {size:,} bytes"), self._current():
+                yield
+        except self._cupy.cuda.memory.OutOfMemoryError as error:
+            raise InputError(
+                f"{self.name}: out of device memory ({size:,} bytes asked for, {self.free_bytes:,} free): "
+                "use fewer particles or a smaller grid, or end other programs on this GPU"
+            ) from error
+
+    def _allow_shared(self, launch: Launch) -> None:
+        limit = int(self.properties["sharedMemPerBlockOptin"])
+        if launch.shared_bytes > limit:
+            raise InputError(
+                f"{self.name}: kernel {launch.name} wants {launch.shared_bytes:,} bytes of shared memory per thread "
+                f"block, this GPU has {limit:,}: use a smaller block shape or float32"
+            )
+        kernel = launch.kernel.handle
+        if kernel.max_dynamic_shared_size_bytes < launch.shared_bytes:
+            kernel.max_dynamic_shared_size_bytes = launch.shared_bytes
+
+
+def _device_index(name: str) -> int:
+    kind, colon, number = name.partition(":")
+    if kind != "cuda" or (colon and not number.isdecimal()):
+        raise InputError(f"unknown device {name!r}: valid are 'simulated', 'cuda' and 'cuda:N' with N = 0, 1, ...")
+    return int(number) if colon else 0
+
+
+def _argument(value: Any) -> Any:
+    """CuPy passes a NumPy array of one element by value, whatever its dtype: the documented way for structs."""
+    return np.asarray(value) if isinstance(value, np.void) else value
+
+
+def _geometry(launch: Launch) -> str:
+    return f"grid {launch.grid}, thread block {launch.block}, {launch.shared_bytes} bytes of shared memory"
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:200]
+
+
+def _first_error(log: str) -> str:
+    """The first line of an NVRTC log that is an error."""
+    lines = [line.strip() for line in log.splitlines() if line.strip()]
+    return next((line for line in lines if "error" in line), lines[0] if lines else "no message")

@@ -1,0 +1,111 @@
+"""Registers, shared memory and spills of a kernel for any architecture, from NVIDIA's ``ptxas``; no GPU needed.
+
+``ptxas`` comes in the wheel nvidia-cuda-nvcc-cu12. What it says for PTX is what the driver's own assembler of the same
+version would load.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import subprocess
+import tempfile
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+from mpmbench.device import KernelInfo
+from mpmbench.errors import InputError
+
+CURE = "pip install 'nvidia-cuda-nvcc-cu12==12.9.*'"
+
+ENTRY = re.compile(r"Compiling entry function '(?P<entry>[^']+)'")
+FUNCTION = re.compile(r"Function properties for (?P<name>\S+)")
+FRAME = re.compile(r"(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads")
+REGISTERS = re.compile(r"Used (\d+) registers")
+STACK = re.compile(r"(\d+) bytes cumulative stack size")
+SHARED = re.compile(r"(\d+) bytes smem")
+
+
+@lru_cache(maxsize=1)
+def find_ptxas() -> Path:
+    """The program of the installed wheel, or an InputError that says what to install."""
+    spec = importlib.util.find_spec("nvidia")
+    for root in (spec.submodule_search_locations or ()) if spec else ():
+        path = Path(root, "cuda_nvcc", "bin", "ptxas")
+        if path.is_file():
+            return path
+    raise InputError(f"ptxas not found in this Python environment: {CURE}")
+
+
+@lru_cache(maxsize=1)
+def ptxas_version() -> str:
+    """Release of the found ``ptxas``, such as "12.9.86"."""
+    text = _call([str(find_ptxas()), "--version"]).stdout
+    match = re.search(r"V(\d+\.\d+\.\d+)", text)
+    return match[1] if match else "unknown"
+
+
+@lru_cache(maxsize=4096)
+def kernel_infos(ptx: str, arch: str) -> dict[str, KernelInfo]:
+    """Facts of every kernel in ``ptx`` when assembled for ``arch`` ("sm_90"), by entry name.
+
+    Raises InputError where ``ptxas`` is missing or refuses the text.
+    """
+    return parse_log(assemble(ptx, arch), arch)
+
+
+def assemble(ptx: str, arch: str) -> str:
+    """Run ``ptxas -v`` on PTX text and return its log; the machine code is thrown away."""
+    with tempfile.TemporaryDirectory(prefix="mpmbench-ptxas-") as folder:
+        source = Path(folder, "kernel.ptx")
+        source.write_text(ptx)
+        done = _call([str(find_ptxas()), "-v", "-arch", arch, "-o", os.devnull, str(source)])
+    log = (done.stdout + done.stderr).replace(str(source), "kernel.ptx")
+    if done.returncode != 0:
+        lines = [line for line in log.splitlines() if "error" in line or "fatal" in line] or log.splitlines()
+        raise InputError(f"ptxas refuses the kernel for {arch}: {lines[0].strip() if lines else 'no message'}")
+    return log
+
+
+def parse_log(log: str, arch: str) -> dict[str, KernelInfo]:
+    """The facts in a log of ``ptxas -v``, by entry name.
+
+    The log gives, kernel by kernel, stack frame and spills and then the registers; functions that were not inlined
+    follow with frame and spills of their own. Their spills are charged to every kernel of the text, for the log does
+    not say who calls them.
+    """
+    infos: dict[str, KernelInfo] = {}
+    entry = function = None
+    frame = spill = function_spill = 0
+    for line in log.splitlines():
+        if match := ENTRY.search(line):
+            entry = match["entry"]
+        elif match := FUNCTION.search(line):
+            function = match["name"]
+        elif match := FRAME.search(line):
+            if function == entry:
+                frame, spill = int(match[1]), int(match[2]) + int(match[3])
+            else:
+                function_spill += int(match[2]) + int(match[3])
+        elif (match := REGISTERS.search(line)) and entry is not None:
+            shared, stack = SHARED.search(line), STACK.search(line)
+            infos[entry] = KernelInfo(
+                arch=arch,
+                registers=int(match[1]),
+                shared_bytes=int(shared[1]) if shared else 0,
+                local_bytes=int(stack[1]) if stack else frame,
+                spill_bytes=spill,
+            )
+            entry, frame, spill = None, 0, 0
+    if function_spill:
+        infos = {n: replace(info, spill_bytes=(info.spill_bytes or 0) + function_spill) for n, info in infos.items()}
+    return infos
+
+
+def _call(command: list[str]) -> subprocess.CompletedProcess[str]:
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError as error:
+        raise InputError(f"cannot run {Path(command[0]).name} ({error.strerror}): {CURE}") from error

@@ -1,0 +1,260 @@
+"""The cuda device over a fake driver: every call follows CuPy's documented signatures, errors are one clear line."""
+
+from __future__ import annotations
+
+import builtins
+import ctypes
+import hashlib
+import inspect
+import json
+import sys
+from pathlib import Path
+
+import cupy
+import numpy as np
+import pytest
+from fake_cupy import FakeGpu, compile_as_cupy_does, documented_signature, fake_cupy
+
+from mpmbench.device import Launch, open_device
+from mpmbench.device.cuda import HOLD_SOURCE, CudaDevice, cupy_options
+from mpmbench.device.ptxas import kernel_infos
+from mpmbench.errors import InputError
+from mpmbench.kernel import COMPILE_OPTIONS, KernelSource, compile_options
+
+GRID = np.dtype([("scale", np.float32), ("count", np.int32)], align=True)
+
+AXPY = """
+struct Grid { float scale; int count; };
+extern "C" __global__ void axpy(float* y, const float* x, Grid grid, double shift)
+{
+    const int i = blockIdx.x * blockDim.x + threadIdx.x;
+    if (i < grid.count) y[i] = grid.scale * x[i] + (float)shift;
+}
+"""
+
+
+def source(text: str, name: str = "axpy") -> KernelSource:
+    return KernelSource(name, text, (), hashlib.sha256(text.encode()).hexdigest())
+
+
+@pytest.fixture
+def gpu(monkeypatch: pytest.MonkeyPatch) -> FakeGpu:
+    machine = FakeGpu()
+    monkeypatch.setitem(sys.modules, "cupy", fake_cupy(machine))
+    return machine
+
+
+def axpy_launch(device: CudaDevice, grid: tuple[int, int, int] = (2, 1, 1), shared_bytes: int = 0) -> Launch:
+    kernel = device.compile(source(AXPY), "axpy")
+    x = device.upload(np.arange(64, dtype=np.float32))
+    y = device.empty(64, np.float32)
+    struct = np.array((2.0, 64), dtype=GRID)[()]
+    return Launch("axpy", kernel, grid, (32, 1, 1), (y, x, struct, np.float64(1)), shared_bytes)
+
+
+def test_documented_signatures_are_read_from_cupy() -> None:
+    memset = documented_signature("cuda.MemoryPointer.memset_async")
+    assert list(memset.parameters) == ["value", "size", "stream"]
+    assert list(documented_signature("RawKernel.__call__").parameters) == ["grid", "block", "args", "shared_mem"]
+    module = documented_signature("RawModule").parameters
+    assert module["options"].kind is inspect.Parameter.KEYWORD_ONLY
+    assert module["options"].annotation is tuple
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda fake: fake.RawModule(source="x"),
+        lambda fake: fake.RawModule(code="x", options=["-std=c++17"]),
+        lambda fake: fake.empty((3,), np.float32, "C", 7),
+        lambda fake: fake.cuda.Stream(nonblocking=True),
+        lambda fake: fake.asarray(np.zeros(3), block=True),
+        lambda fake: fake.RawModule(code=AXPY).get_function("axpy")((1,), (1,), (), shared_memory=4),
+    ],
+)
+def test_fake_refuses_a_call_that_cupy_would_refuse(wrong) -> None:
+    with pytest.raises(TypeError):
+        wrong(fake_cupy(FakeGpu()))
+
+
+def test_fake_cannot_have_a_function_that_cupy_lacks() -> None:
+    with pytest.raises(AttributeError):
+        documented_signature("cuda.Stream.flush")
+
+
+def test_device_compiles_uploads_launches_and_downloads(gpu: FakeGpu) -> None:
+    device = open_device("cuda")
+    assert (device.name, device.arch) == ("cuda:0", "sm_90")
+    launch = axpy_launch(device)
+    device.launch(launch)
+    device.synchronize()
+    call = gpu.details("kernel")[-1]
+    assert (call.name, call.grid, call.block, call.shared) == ("axpy", (2, 1, 1), (32, 1, 1), 0)
+    assert call.stream is not None, "kernels must not run on the default stream"
+    assert not call.stream.null
+    struct = call.args[2]
+    assert isinstance(struct, np.ndarray), "CuPy documents one-element arrays as the way to pass a struct by value"
+    assert struct.size == 1
+    assert struct.tobytes() == np.array((2.0, 64), dtype=GRID).tobytes()
+    np.testing.assert_array_equal(device.download(launch.args[1]), np.arange(64, dtype=np.float32))
+
+
+def test_cupy_itself_passes_the_bytes_of_our_arguments() -> None:
+    """On the real CuPy: what it would hand to the driver is the value's memory, structs included."""
+    struct = np.array((2.5, 7), dtype=GRID)
+    pointer = cupy.cuda.function.CNumpyArray(struct).ptr
+    assert ctypes.string_at(pointer, GRID.itemsize) == struct.tobytes()
+
+
+def test_empty_grid_is_not_launched(gpu: FakeGpu) -> None:
+    """CuPy turns a grid of 0 into one thread block (cupy/cuda/function.pyx); a launch over nothing must do nothing."""
+    device = CudaDevice("cuda")
+    device.launch(axpy_launch(device, grid=(0, 1, 1)))
+    assert not gpu.details("kernel")
+
+
+def test_options_are_those_of_the_simulated_device_once_cupy_has_added_its_own() -> None:
+    appended = ("-ftz=true", "-default-device")
+    assert sorted((*cupy_options(COMPILE_OPTIONS), *appended)) == sorted(COMPILE_OPTIONS)
+    text = Path(cupy.cuda.compiler.__file__).read_text()
+    assert "options += ('-ftz=true',)" in text, "CuPy no longer appends -ftz=true: revise cupy_options"
+    assert "--device-as-default-execution-space" in text
+
+
+def test_both_devices_get_the_same_ptx() -> None:
+    """CuPy's way to PTX and ours agree to the last character of code."""
+    program = cupy.cuda.compiler._NVRTCProgram(AXPY, "fake.cu", method="ptx")
+    ours, _ = program.compile(compile_options("sm_52"))
+    ours = ours.decode() if isinstance(ours, bytes) else ours
+    assert compile_as_cupy_does(AXPY, cupy_options(COMPILE_OPTIONS), "52") == ours
+
+
+def test_property_names_exist_in_cupy() -> None:
+    """The keys of getDeviceProperties show only on a GPU; their names are in CuPy's binary."""
+    binary = Path(cupy.cuda.runtime.getDeviceCount.__self__.__file__).read_bytes()
+    gpu = FakeGpu()
+    for key in fake_cupy(gpu).cuda.runtime.getDeviceProperties(0):
+        assert key.encode() in binary, key
+
+
+def test_facts_for_the_record(gpu: FakeGpu) -> None:
+    facts = CudaDevice("cuda").facts
+    assert facts["name"] == "Fake GPU"
+    assert facts["arch"] == "sm_90"
+    assert facts["nvrtc"] == "12.9"
+    json.dumps(facts)
+
+
+def test_large_shared_memory_is_asked_for_once(gpu: FakeGpu) -> None:
+    device = CudaDevice("cuda")
+    launch = axpy_launch(device, shared_bytes=100_000)
+    device.launch(launch)
+    assert launch.kernel.handle.max_dynamic_shared_size_bytes == 100_000
+
+
+def test_timing_calls(gpu: FakeGpu) -> None:
+    device = CudaDevice("cuda:0")
+    launch = axpy_launch(device)
+    gpu.seconds = {"axpy": 0.0025}
+    device.flush_cache()
+    device.synchronize()
+    device.hold(50e-6)
+    start = device.record()
+    device.launch(launch)
+    end = device.record()
+    device.synchronize()
+    assert device.elapsed(start, end) == pytest.approx(0.0025)
+    assert gpu.names()[-7:] == ["flush", "sync", "kernel", "event", "kernel", "event", "sync"]
+    size, stream = gpu.details("flush")[0]
+    assert size == 2 * gpu.l2_bytes
+    assert all(used is stream for used in (*gpu.details("sync"), *gpu.details("event")))
+    assert all(call.stream is stream for call in gpu.details("kernel"))
+    assert gpu.details("kernel")[-2].args == (np.uint64(50_000),)
+
+
+@pytest.mark.parametrize("arch", ["sm_52", "sm_90", "sm_120"])
+def test_hold_kernel_compiles_for_every_gpu(arch: str) -> None:
+    ptx = compile_as_cupy_does(HOLD_SOURCE, cupy_options(COMPILE_OPTIONS), arch.removeprefix("sm_"))
+    assert kernel_infos(ptx, arch)["mpmbench_hold"].spill_bytes == 0
+
+
+# Errors
+
+
+def test_no_cupy(monkeypatch: pytest.MonkeyPatch) -> None:
+    real_import = builtins.__import__
+
+    def refuse(name, *args, **kwargs):
+        if name == "cupy":
+            raise ImportError("No module named 'cupy'")
+        return real_import(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    with pytest.raises(InputError, match=r"mpmbench\[cuda12x\]"):
+        open_device("cuda")
+
+
+def test_no_driver_on_real_cupy() -> None:
+    if cupy.cuda.is_available():
+        pytest.skip("this machine has a GPU")
+    with pytest.raises(InputError, match=r"no GPU for device 'cuda'.*simulated"):
+        open_device("cuda")
+
+
+def test_no_gpu(gpu: FakeGpu) -> None:
+    gpu.count = 0
+    with pytest.raises(InputError, match="no GPU for device 'cuda'"):
+        open_device("cuda")
+    gpu.fail_count = cupy.cuda.runtime.CUDARuntimeError(100)
+    with pytest.raises(InputError, match="cudaErrorNoDevice"):
+        open_device("cuda")
+
+
+@pytest.mark.parametrize(("name", "message"), [("cuda:3", "cuda:0 to cuda:0"), ("cuda:x", "unknown device 'cuda:x'")])
+def test_no_such_gpu(gpu: FakeGpu, name: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        open_device(name)
+
+
+def test_out_of_memory(gpu: FakeGpu) -> None:
+    gpu.memory_bytes = 1000
+    device = CudaDevice("cuda")
+    with pytest.raises(InputError, match=r"out of device memory \(4,000 bytes asked for, 1,000 free\)"):
+        device.empty(1000, np.float32)
+    with pytest.raises(InputError, match="out of device memory"):
+        device.upload(np.zeros(1000, np.float32))
+
+
+def test_source_that_does_not_compile(gpu: FakeGpu) -> None:
+    device = CudaDevice("cuda")
+    text = '#line 7 "mine.cu"\nextern "C" __global__ void axpy() { undefined = 1; }\n'
+    with pytest.raises(InputError, match=r"mine.cu\(7\).*undefined"):
+        device.compile(source(text), "axpy")
+    with pytest.raises(InputError, match="cannot load kernel missing"):
+        device.compile(source(AXPY), "missing")
+
+
+def test_launch_failure_names_the_kernel(gpu: FakeGpu) -> None:
+    device = CudaDevice("cuda")
+    launch = axpy_launch(device)
+    gpu.fail_launch = cupy.cuda.runtime.CUDARuntimeError(701)
+    with pytest.raises(InputError, match=r"kernel axpy cannot be launched \(grid \(2, 1, 1\).*LaunchOutOfResources"):
+        device.launch(launch)
+
+
+def test_failure_of_an_earlier_kernel_is_reported_when_waiting(gpu: FakeGpu) -> None:
+    device = CudaDevice("cuda")
+    launch = axpy_launch(device)
+    device.launch(launch)
+    gpu.fail_synchronize = cupy.cuda.runtime.CUDARuntimeError(700)
+    with pytest.raises(InputError, match=r"launched before has failed.*IllegalAddress.*debug"):
+        device.synchronize()
+    with pytest.raises(InputError, match="launched before has failed"):
+        device.download(launch.args[0])
+
+
+def test_too_much_shared_memory(gpu: FakeGpu) -> None:
+    device = CudaDevice("cuda")
+    with pytest.raises(InputError, match="this GPU has 232,448: use a smaller block shape"):
+        device.launch(axpy_launch(device, shared_bytes=300_000))
+    assert not gpu.details("kernel")
