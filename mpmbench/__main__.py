@@ -1,0 +1,5 @@
+"""``python -m mpmbench`` is the command line."""
+
+from mpmbench.cli import main
+
+main()

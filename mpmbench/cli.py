@@ -1,0 +1,459 @@
+"""The command line: ``mpmbench list | run | check | report | selftest | doctor | env``.
+
+Names and axis syntax follow NVBench. Exit codes: 0 ok, 1 harness error, 2 usage or bad input, 3 regression, 4 wrong
+results or findings, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table as RichTable
+
+from mpmbench.errors import InputError, MpmbenchError
+
+console = Console(stderr=False, highlight=False)
+notes = Console(stderr=True, highlight=False)  # progress and warnings: standard output stays parseable
+
+WRONG_RESULT = 4
+INTERRUPTED = 130
+
+
+class _Group(click.Group):
+    """Turns every error that a user can mend into one line and an exit code."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except MpmbenchError as error:
+            notes.print(f"mpmbench: {error}", soft_wrap=True, markup=False, style="red")
+            ctx.exit(error.exit_code)
+        except OSError as error:
+            if isinstance(error, BrokenPipeError):
+                raise
+            where = f"{error.filename}: " if error.filename else ""
+            notes.print(f"mpmbench: {where}{(error.strerror or str(error)).lower()}", soft_wrap=True, markup=False)
+            ctx.exit(InputError.exit_code)
+        except MemoryError:
+            notes.print("mpmbench: out of memory: take fewer particles (--particles) or a smaller grid", soft_wrap=True)
+            ctx.exit(1)
+        except KeyboardInterrupt:
+            notes.print("mpmbench: interrupted; finished rows are on disk, --resume goes on from there", soft_wrap=True)
+            ctx.exit(INTERRUPTED)
+
+
+@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(package_name="mpmbench", message="mpmbench %(version)s")
+def main() -> None:
+    """Which particle-grid transfer strategy is fastest on this GPU, for these particles, at this accuracy, and why?
+
+    Without a GPU the same CUDA kernels run on a simulated device: checked, counted, never timed.
+    """
+
+
+# --- choosing cases ---------------------------------------------------------------------------------------------------
+
+
+def _selection(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The options that choose variants, datasets, axes and the device; shared by run and check."""
+    options = [
+        click.option("-b", "--benchmark", "patterns", multiple=True, metavar="GLOB", help="Variants by name or glob."),
+        click.option("--dataset", "datasets", multiple=True, metavar="NAME|FILE",
+                     help="Recipe name, or a .npz/.npy file of your own particles. Default: uniform_cube."),
+        click.option("-a", "--axis", "axes", multiple=True, metavar="AXIS=VALUES",
+                     help='Axis values: -a dtype=float64, -a "batching=[1,2,4]", -a "block_shape=[8x4x4,4x4x4]".'),
+        click.option("--particles", type=click.IntRange(min=0), help="Particles of recipe datasets."),
+        click.option("--particles-per-cell", "--ppc", type=click.IntRange(min=1), help="Density where it is exact."),
+        click.option("--seed", type=click.IntRange(min=0), help="Seed of recipe datasets."),
+        click.option("-d", "--device", "devices", multiple=True, metavar="DEVICE",
+                     help="simulated, cuda, cuda:N. Default: simulated, and cuda where there is a GPU."),
+        click.option("--arch", default=None, metavar="sm_XX", help="Architecture the simulated device compiles for."),
+        click.option("--variants", "variant_dirs", multiple=True, type=click.Path(path_type=Path), metavar="DIR",
+                     help="A folder with your own kernel (.cu) and module (.py); may be given again."),
+        click.option("--quick", is_flag=True, help="At most 20,000 particles of recipe datasets, fewer samples."),
+    ]  # fmt: skip
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def _choose(
+    patterns: Sequence[str],
+    datasets: Sequence[str],
+    axes: Sequence[str],
+    particles: int | None,
+    particles_per_cell: int | None,
+    seed: int | None,
+    variant_dirs: Sequence[Path],
+    quick: bool,
+    preset_name: str | None = None,
+) -> list[Any]:
+    """The cases that the options ask for."""
+    from dataclasses import replace
+
+    from mpmbench import presets
+    from mpmbench.runner import DatasetChoice, cases_of
+    from mpmbench.variants import discover
+
+    if preset_name is not None:
+        if datasets or axes:
+            raise InputError("--preset fixes datasets and axes: leave out --dataset and -a, or leave out --preset")
+        cases = presets.preset(preset_name)
+        if patterns:
+            wanted = {v.name for v in _match(discover(), patterns)}
+            cases = [case for case in cases if case.variant.name in wanted]
+        limit = particles if particles is not None else QUICK_PARTICLES if quick else None
+        if limit is not None:
+            # A shrunken row is no repetition of the published one: it loses its place beside the printed figures.
+            cases = [
+                replace(case, dataset=replace(case.dataset, particles=limit), preset_row=None)
+                if case.dataset.particles is not None
+                else case
+                for case in cases
+            ]
+        return cases
+    variants = discover(variant_dirs)
+    chosen = _match(variants, patterns) if patterns else variants
+    size = particles if particles is not None else QUICK_PARTICLES if quick else None
+    choices = []
+    for name in datasets or ("uniform_cube",):
+        is_file = Path(name).suffix in {".npz", ".npy"}
+        from_recipe = not is_file and name != "splash"
+        choices.append(DatasetChoice(name, size if from_recipe else particles, particles_per_cell, seed))
+    return cases_of(chosen, choices, dict(map(_parse_axis, axes)))
+
+
+QUICK_PARTICLES = 20_000
+
+
+def _match(variants: Iterable[Any], patterns: Sequence[str]) -> list[Any]:
+    variants = list(variants)
+    chosen = []
+    for pattern in patterns:
+        found = [v for v in variants if fnmatch.fnmatchcase(v.name, pattern)]
+        if not found:
+            raise InputError(f"no variant matches {pattern!r}: valid are {', '.join(v.name for v in variants)}")
+        chosen += [v for v in found if v not in chosen]
+    return chosen
+
+
+def _parse_axis(text: str) -> tuple[str, list[Any]]:
+    """``batching=[1,2]`` -> ("batching", [1, 2])."""
+    from mpmbench.presets import parse_value
+
+    name, equals, values = text.partition("=")
+    words = [w.strip() for w in values.strip().removeprefix("[").removesuffix("]").split(",")]
+    if not equals or not all(words):
+        raise InputError(f"cannot read axis {text!r}: write it as name=value or name=[value,value]")
+    return name.strip(), [parse_value(word) for word in words]
+
+
+def _open_devices(names: Sequence[str], arch: str | None, mode: str) -> list[Any]:
+    from mpmbench.device import open_device
+
+    if not names:
+        names = ["simulated", *(["cuda"] if _gpu_present() else [])]
+    options = {"mode": mode} | ({"arch": arch} if arch else {})
+    return [open_device(name, **(options if name == "simulated" else {})) for name in names]
+
+
+def _gpu_present() -> bool:
+    from mpmbench.device import open_device
+
+    try:
+        open_device("cuda")
+    except MpmbenchError:
+        return False
+    return True
+
+
+# --- commands ---------------------------------------------------------------------------------------------------------
+
+
+@main.command("list")
+@click.option("--variants", "variant_dirs", multiple=True, type=click.Path(path_type=Path), metavar="DIR")
+@click.option("--json", "as_json", is_flag=True, help="Machine-readable.")
+def list_command(variant_dirs: Sequence[Path], as_json: bool) -> None:
+    """Variants with their axes, datasets, presets and devices. Runs nothing."""
+    from mpmbench import presets
+    from mpmbench.api import list_datasets, list_devices
+    from mpmbench.runner import format_axis
+    from mpmbench.variants import discover, resolve_axes
+
+    variants = discover(variant_dirs)
+    if as_json:
+        content = {
+            "variants": {v.name: {"summary": v.summary, "axes": _axis_values(v)} for v in variants},
+            "datasets": {d.name: d.summary for d in list_datasets()},
+            "presets": list(presets.PRESETS),
+            "devices": {d.name: d.summary for d in list_devices()},
+        }
+        click.echo(json.dumps(content, indent=2))
+        return
+    for title, rows in (
+        ("Variants", [(v.name, v.summary) for v in variants]),
+        ("Datasets", [(d.name, d.summary) for d in list_datasets()]),
+        ("Presets", [(name, (make.__doc__ or "").split("\n")[0]) for name, make in presets.PRESETS.items()]),
+        ("Devices", [(d.name, d.summary) for d in list_devices()]),
+    ):
+        table = RichTable("name", "what it is", title=title, title_justify="left", box=None, padding=(0, 2, 0, 0))
+        for name, summary in rows:
+            table.add_row(name, summary)
+        console.print(table)
+        console.print()
+    axes = RichTable("axis", "values (* default)", title="Axes", title_justify="left", box=None, padding=(0, 2, 0, 0))
+    seen: dict[str, list[Any]] = {}
+    for variant in variants:
+        for name, values in _axis_values(variant).items():
+            seen.setdefault(name, values)
+    defaults = {name: value for v in variants for name, value in resolve_axes(v, {}).items()}
+    for name, values in seen.items():
+        axes.add_row(name, "  ".join(format_axis(v) + ("*" if v == defaults[name] else "") for v in values))
+    console.print(axes)
+
+
+def _axis_values(variant: Any) -> dict[str, list[Any]]:
+    return {name: list(axis.values) for name, axis in variant.axes.items()}
+
+
+@main.command()
+@_selection
+@click.option("--preset", "preset_name", metavar="NAME", help="A named selection: demo, thesis.")
+@click.option("--json", "json_path", type=click.Path(path_type=Path), metavar="FILE", help="Records, one per line.")
+@click.option("--html", "html_path", type=click.Path(path_type=Path), metavar="FILE", help="One-file report.")
+@click.option("--md", "md_path", type=click.Path(path_type=Path), metavar="FILE", help="Markdown report.")
+@click.option("--csv", "csv_path", type=click.Path(path_type=Path), metavar="FILE", help="One flat row per record.")
+@click.option("--resume", is_flag=True, help="Keep the rows of --json FILE, run only what is missing.")
+@click.option("--dry-run", is_flag=True, help="Say what would run, and stop.")
+def run(
+    preset_name: str | None,
+    json_path: Path | None,
+    html_path: Path | None,
+    md_path: Path | None,
+    csv_path: Path | None,
+    resume: bool,
+    dry_run: bool,
+    devices: Sequence[str],
+    arch: str | None,
+    quick: bool,
+    **selection: Any,
+) -> None:
+    """Run variants: check each result, then count it (simulated) or time it (cuda).
+
+    \b
+    mpmbench run --quick
+    mpmbench run -b "p2g_*" --dataset random -a "batching=[1,4]" --json rows.jsonl --html report.html
+    mpmbench run --dataset my_particles.npz
+    """
+    cases = _choose(**selection, quick=quick, preset_name=preset_name)
+    if resume and json_path is None:
+        raise InputError("--resume needs --json FILE, the file whose rows it keeps")
+    _refuse_folders([json_path, html_path, md_path, csv_path])
+    opened = _open_devices(devices, arch, "count")
+    if dry_run:
+        for device in opened:
+            for case in cases:
+                console.print(f"{device.name} {device.arch}  {case.title}", markup=False, soft_wrap=True)
+        console.print(f"{len(cases) * len(opened)} rows")
+        return
+    records = _run_cases(cases, opened, json_path, "append" if resume else "replace", quick)
+    _write_reports(records, html_path, md_path, csv_path)
+    _summarise(records, [p for p in (json_path, html_path, md_path, csv_path) if p])
+
+
+@main.command()
+@_selection
+@click.option("--debug", is_flag=True, help="Poisoned shared memory, race checks, shuffled warp order (simulated only).")
+@click.option("--json", "json_path", type=click.Path(path_type=Path), metavar="FILE", help="Records, one per line.")
+def check(
+    debug: bool, json_path: Path | None, devices: Sequence[str], arch: str | None, quick: bool, **selection: Any
+) -> None:
+    """Hold variants to the float64 reference, without counting or timing. Exit code 4 if one fails."""
+    cases = _choose(**selection, quick=quick)
+    opened = _open_devices(devices, arch, "debug" if debug else "run")
+    records = _run_cases(cases, opened, json_path, "replace", quick)
+    for record in records:
+        error = f"error/allowed {record.check.ratio:.3f}" if record.check else ""
+        reason = record.skipped_because or record.failed_because or ""
+        console.print(f"{record.status:9}{record.device:10} {record.variant} {record.dataset.name} {error}{reason}",
+                      markup=False, soft_wrap=True)  # fmt: skip
+        for finding in record.findings:
+            console.print(f"         {finding.message}", markup=False, soft_wrap=True)
+    _summarise(records, [json_path] if json_path else [])
+
+
+@main.command()
+@click.argument("records", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--html", "html_path", type=click.Path(path_type=Path), metavar="FILE")
+@click.option("--md", "md_path", type=click.Path(path_type=Path), metavar="FILE")
+@click.option("--csv", "csv_path", type=click.Path(path_type=Path), metavar="FILE")
+def report(records: Sequence[Path], html_path: Path | None, md_path: Path | None, csv_path: Path | None) -> None:
+    """Rebuild a report from RECORDS files, on any machine. Prints Markdown if no file is named."""
+    from mpmbench.record import read_records
+    from mpmbench.report.markdown import markdown_report
+
+    rows = [row for path in records for row in read_records(path)]
+    if not rows:
+        raise InputError(f"no records in {', '.join(map(str, records))}: nothing to report")
+    _refuse_folders([html_path, md_path, csv_path])
+    if html_path or md_path or csv_path:
+        _write_reports(rows, html_path, md_path, csv_path)
+        for path in filter(None, (html_path, md_path, csv_path)):
+            console.print(f"wrote {path}", markup=False, soft_wrap=True)
+    else:
+        click.echo(markdown_report(rows))
+
+
+@main.command()
+@click.option("-d", "--device", default=None, metavar="DEVICE", help="Default: cuda where there is a GPU.")
+@click.option("--arch", default=None, metavar="sm_XX")
+@click.option("--quick", is_flag=True, help="The smallest datasets only.")
+def selftest(device: str | None, arch: str | None, quick: bool) -> None:
+    """Run every strategy on a device, hold it to the reference and (on a GPU) to the simulated device."""
+    from mpmbench.selftest import run_selftest
+
+    name = device or ("cuda" if _gpu_present() else "simulated")
+    failed = 0
+    rows = run_selftest(name, quick=quick, arch=arch)
+    for row in rows:
+        failed += not row.passed
+        console.print(str(row), markup=False, soft_wrap=True)
+    console.print(f"{name}: {len(rows) - failed} passed, {failed} failed")
+    if failed:
+        sys.exit(WRONG_RESULT)
+
+
+@main.command()
+def doctor() -> None:
+    """What is present, what is missing, and what to do about it."""
+    from mpmbench.doctor import diagnose
+
+    marks = {"ok": "[green]ok     [/]", "warn": "[yellow]warn   [/]", "missing": "[red]missing[/]"}
+    for item in diagnose():
+        console.print(f"{marks[item.status]} {item.name}: ", end="")
+        console.print(item.detail, markup=False, soft_wrap=True)
+        if item.remedy and item.status != "ok":
+            console.print(f"        -> {item.remedy}", markup=False, soft_wrap=True)
+
+
+@main.command()
+def env() -> None:
+    """Versions and machine, to paste into a bug report."""
+    from dataclasses import asdict
+
+    from mpmbench.environment import Environment
+
+    for name, value in asdict(Environment.capture(argv=[])).items():
+        if value not in (None, (), {}):
+            click.echo(f"{name}: {value}")
+
+
+# --- running ----------------------------------------------------------------------------------------------------------
+
+
+def _run_cases(cases: list[Any], devices: list[Any], json_path: Path | None, existing: Any, quick: bool) -> list[Any]:
+    from mpmbench import measure
+    from mpmbench.environment import Environment
+    from mpmbench.record import RecordWriter, read_records
+    from mpmbench.runner import Inputs, resume_key, run_case
+
+    # SIGTERM ends a run as Ctrl-C does: the row in flight is lost, the others are on disk.
+    signal.signal(signal.SIGTERM, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
+    kept: dict[Any, Any] = {}
+    if json_path is not None and existing == "append" and json_path.exists():
+        kept = {resume_key(record): record for record in read_records(json_path)}
+    environment = Environment.capture()
+    sampling = measure.QUICK if quick else None
+    records: list[Any] = []
+    inputs = Inputs()
+    total = len(cases) * len(devices)
+    writer = RecordWriter(json_path, existing) if json_path else None
+    try:
+        with _progress() as progress:
+            task = progress.add_task("", total=total)
+            for device in devices:
+                for case in cases:
+                    progress.update(task, description=f"{device.name} {case.title}")
+                    record = kept.get(resume_key(case, device, inputs)) if kept else None
+                    if record is None:
+                        record = run_case(case, device, inputs, environment, sampling)
+                        if writer:
+                            writer.write(record)
+                    records.append(record)
+                    progress.advance(task)
+                    if not progress.console.is_terminal:
+                        notes.print(f"[{len(records)}/{total}] {device.name} {case.title}: {record.status}",
+                                    markup=False, soft_wrap=True)  # fmt: skip
+    finally:
+        if writer:
+            writer.close()
+    return records
+
+
+def _progress() -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=24),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=notes,
+        disable=not notes.is_terminal,
+    )
+
+
+def _refuse_folders(paths: Sequence[Path | None]) -> None:
+    for path in filter(None, paths):
+        if path.is_dir():
+            raise InputError(f"{path} is a folder: name a file in it")
+
+
+def _write_reports(records: list[Any], html: Path | None, md: Path | None, csv: Path | None) -> None:
+    from mpmbench.report import write_report
+
+    if html or md:
+        write_report(records, html=html, markdown=md)
+    if csv:
+        import pandas as pd
+
+        from mpmbench.record import flatten
+
+        csv.parent.mkdir(parents=True, exist_ok=True)
+        partial = csv.with_name(csv.name + ".partial")
+        pd.DataFrame([flatten(record) for record in records]).to_csv(partial, index=False)
+        os.replace(partial, csv)
+
+
+def _summarise(records: list[Any], written: Sequence[Path]) -> None:
+    """One line of verdict, the problems, the files; exit code 4 where a result is wrong."""
+    by_status: dict[str, int] = {}
+    for record in records:
+        by_status[record.status] = by_status.get(record.status, 0) + 1
+    for record in records:
+        reason = record.skipped_because or record.failed_because
+        if record.status not in ("ok",):
+            detail = reason or (f"error {record.check.ratio:.3g} x allowed" if record.check else "")
+            notes.print(f"{record.status}: {record.variant} on {record.dataset.name}: {detail}", markup=False, soft_wrap=True)
+    counted = ", ".join(f"{count} {status}" for status, count in sorted(by_status.items()))
+    console.print(f"{len(records)} rows: {counted}")
+    for path in written:
+        console.print(f"wrote {path}", markup=False, soft_wrap=True)
+    if any(record.status in ("wrong", "findings") for record in records):
+        sys.exit(WRONG_RESULT)
+    if any(record.status == "broken" for record in records):
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()
