@@ -13,6 +13,12 @@ constexpr int ARENA_Y = BLOCK_Y + LEFT + RIGHT;
 constexpr int ARENA_Z = BLOCK_Z + LEFT + RIGHT;
 constexpr int ARENA = ARENA_X * ARENA_Y * ARENA_Z;
 
+// Launch bounds of block kernels are (THREADS, 1): the one block says that registers may be spent, not spilled.
+
+// Keeps loads of the arena inside the particle loop. They do not change there, and the compiler would otherwise move all
+// SUPPORT of them in front of it, into more registers than there are.
+__device__ inline void forget_loads() { asm volatile("" ::: "memory"); }
+
 // A range of sorted particles.
 struct Bin {
     int start, count;

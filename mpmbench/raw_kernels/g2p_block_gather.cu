@@ -5,7 +5,7 @@
 #include "block.cuh"
 #include "transfer.cuh"
 
-extern "C" __global__ void __launch_bounds__(THREADS) g2p_block_gather(
+extern "C" __global__ void __launch_bounds__(THREADS, 1) g2p_block_gather(
     const Domain domain,
     const int particle_count,
     const real4* __restrict__ particles,
@@ -33,6 +33,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) g2p_block_gather(
     const Bin bin = bin_of(domain, bin_start, block.first.x + own.x, block.first.y + own.y, block.first.z + own.z);
 
     for (int first = 0; first < bin.count; first += BATCH) {
+        forget_loads();
         real3 f[BATCH];
         Weights weights[BATCH];
         Gathered sum[BATCH];

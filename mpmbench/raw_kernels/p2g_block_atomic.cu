@@ -4,7 +4,7 @@
 // Constants: BATCH and those of the headers. Shared memory: one real4 per node of the arena.
 #include "arena_sum.cuh"
 
-extern "C" __global__ void __launch_bounds__(THREADS) p2g_block_atomic(
+extern "C" __global__ void __launch_bounds__(THREADS, 1) p2g_block_atomic(
     const Domain domain,
     const int particle_count,
     const real4* __restrict__ particles,

@@ -33,7 +33,7 @@ __device__ inline Source staged_source(const real4 (*staged)[STAGED][ARENA], int
     return source;
 }
 
-extern "C" __global__ void __launch_bounds__(THREADS) p2g_block_pull(
+extern "C" __global__ void __launch_bounds__(THREADS, 1) p2g_block_pull(
     const Domain domain,
     const int particle_count,
     const real4* __restrict__ particles,
