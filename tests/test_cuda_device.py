@@ -16,7 +16,7 @@ import pytest
 from fake_cupy import FakeGpu, compile_as_cupy_does, documented_signature, fake_cupy
 
 from mpmbench.device import Launch, open_device
-from mpmbench.device.cuda import HOLD_SOURCE, CudaDevice, cupy_options
+from mpmbench.device.cuda import HOLD_SOURCE, CudaDevice, cupy_options, list_gpus
 from mpmbench.device.ptxas import kernel_infos
 from mpmbench.errors import InputError
 from mpmbench.kernel import COMPILE_OPTIONS, KernelSource, compile_options
@@ -135,6 +135,17 @@ def test_property_names_exist_in_cupy() -> None:
     gpu = FakeGpu()
     for key in fake_cupy(gpu).cuda.runtime.getDeviceProperties(0):
         assert key.encode() in binary, key
+
+
+def test_list_gpus(gpu: FakeGpu) -> None:
+    gpu.count = 2
+    assert list_gpus() == [("cuda:0", "Fake GPU, sm_90, 1.0 GiB"), ("cuda:1", "Fake GPU, sm_90, 1.0 GiB")]
+
+
+def test_gpu_compiles_for_itself(gpu: FakeGpu) -> None:
+    assert open_device("cuda:0", arch="sm_90").arch == "sm_90"
+    with pytest.raises(InputError, match="compiles for itself, sm_90"):
+        open_device("cuda:0", arch="sm_52")
 
 
 def test_facts_for_the_record(gpu: FakeGpu) -> None:

@@ -68,7 +68,7 @@ class CudaDevice:
     Besides the device protocol it offers what ``measure`` needs: ``flush_cache``, ``hold``, ``record``, ``elapsed``.
     """
 
-    def __init__(self, name: str = "cuda") -> None:
+    def __init__(self, name: str = "cuda", arch: str | None = None) -> None:
         index = _device_index(name)
         self._cupy = import_cupy()
         cuda = self._cupy.cuda
@@ -82,12 +82,16 @@ class CudaDevice:
         if index >= count:
             last = count - 1
             raise InputError(f"no GPU {index} for device {name!r}: this machine has cuda:0 to cuda:{last}")
-        self.name = f"cuda:{index}"
+        self.name, self.count = f"cuda:{index}", count
         self._gpu = cuda.Device(index)
         with self._errors("cannot use the GPU"), self._gpu:
             self.properties: dict[str, Any] = cuda.runtime.getDeviceProperties(index)
             self.arch = f"sm_{self._gpu.compute_capability}"
             self._stream = cuda.Stream(non_blocking=True)
+        if arch not in (None, self.arch):
+            raise InputError(
+                f"{self.name} compiles for itself, {self.arch}, not for {arch}: leave the architecture out"
+            )
         self._hold_kernel: Any = None
         self._flush_buffer: Any = None
 
@@ -239,6 +243,18 @@ class CudaDevice:
         kernel = launch.kernel.handle
         if kernel.max_dynamic_shared_size_bytes < launch.shared_bytes:
             kernel.max_dynamic_shared_size_bytes = launch.shared_bytes
+
+
+def list_gpus() -> list[tuple[str, str]]:
+    """Name ("cuda:0") and a one-line summary of each GPU; InputError where there is none, or no CuPy."""
+    gpus, index = [], 0
+    while True:
+        device = CudaDevice(f"cuda:{index}")
+        facts = device.facts
+        gpus.append((device.name, f"{facts['name']}, {facts['arch']}, {facts['memory_bytes'] / 2**30:.1f} GiB"))
+        index += 1
+        if index == device.count:
+            return gpus
 
 
 def _device_index(name: str) -> int:

@@ -7,16 +7,18 @@ version would load.
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import re
 import subprocess
 import tempfile
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
 
 from mpmbench.device import KernelInfo
 from mpmbench.errors import InputError
+from mpmbench.simt import cache
 
 CURE = "pip install 'nvidia-cuda-nvcc-cu12==12.9.*'"
 
@@ -47,13 +49,17 @@ def ptxas_version() -> str:
     return match[1] if match else "unknown"
 
 
-@lru_cache(maxsize=4096)
 def kernel_infos(ptx: str, arch: str) -> dict[str, KernelInfo]:
-    """Facts of every kernel in ``ptx`` when assembled for ``arch`` ("sm_90"), by entry name.
+    """Facts of every kernel in ``ptx`` when assembled for ``arch`` ("sm_90"), by entry name; kept on disk.
 
     Raises InputError where ``ptxas`` is missing or refuses the text.
     """
-    return parse_log(assemble(ptx, arch), arch)
+    key = cache.content_key("ptxas", ptxas_version(), arch, ptx)
+    if (stored := cache.load("ptxas", key)) is not None:
+        return {entry: KernelInfo(**facts) for entry, facts in json.loads(stored).items()}
+    infos = parse_log(assemble(ptx, arch), arch)
+    cache.store("ptxas", key, json.dumps({entry: asdict(info) for entry, info in infos.items()}).encode())
+    return infos
 
 
 def assemble(ptx: str, arch: str) -> str:
