@@ -44,6 +44,15 @@ def nvrtc_version() -> str:
     return f"{major.value}.{minor.value}"
 
 
+def supported_archs() -> list[str]:
+    """What the NVRTC library compiles for, such as ``["sm_50", "sm_52", ...]``."""
+    nvrtc, count = _library().handle(), ctypes.c_int()
+    nvrtc.nvrtcGetNumSupportedArchs(ctypes.byref(count))
+    numbers = (ctypes.c_int * count.value)()
+    nvrtc.nvrtcGetSupportedArchs(numbers)
+    return [f"sm_{number}" for number in numbers]
+
+
 class _Library:
     """The shared library. It is opened at the first compile only: a warm cache never needs it."""
 
