@@ -1,0 +1,225 @@
+"""The doctor: every finding has a remedy of one line, and nothing makes it raise."""
+
+from __future__ import annotations
+
+import sys
+from importlib import metadata
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from fake_cupy import FakeGpu, fake_cupy
+
+from mpmbench import doctor
+from mpmbench.doctor import Check, diagnose, satisfies
+from mpmbench.errors import InputError
+
+
+def by_name(checks: list[Check]) -> dict[str, Check]:
+    return {check.name: check for check in checks}
+
+
+def test_this_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MPMBENCH_CACHE_DIR", str(tmp_path / "cache"))
+    checks = diagnose()
+    found = by_name(checks)
+    assert {
+        "Python",
+        "numpy",
+        "numba",
+        "llvmlite",
+        "NVRTC",
+        "ptxas",
+        "CPU",
+        "memory",
+        "kernel cache",
+        "disk",
+        "CuPy",
+    } <= (found.keys())
+    for name in ("numba", "llvmlite", "NVRTC", "ptxas", "kernel cache"):
+        assert found[name].status == "ok", found[name]
+    assert "sm_52" in doctor.nvrtc()[0].detail or "sm_50" in doctor.nvrtc()[0].detail
+    for check in checks:
+        assert check.detail
+        assert "\n" not in check.detail + check.remedy
+        assert (check.status == "ok") == (not check.remedy), check
+
+
+def test_a_look_that_fails_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken() -> list[Check]:
+        raise RuntimeError("cannot\nread")
+
+    def refused() -> list[Check]:
+        raise InputError("no such thing")
+
+    monkeypatch.setattr(doctor, "LOOKS", (("one", broken), ("two", refused)))
+    one, two = diagnose()
+    assert (one.status, one.detail) == ("warn", "cannot be looked at: RuntimeError: cannot read")
+    assert (two.status, two.detail) == ("missing", "no such thing")
+
+
+def installed(monkeypatch: pytest.MonkeyPatch, **versions: str | None) -> None:
+    """Pretend that distributions (names with _ for -) are installed in these versions, None: not installed."""
+    real = metadata.version
+    wanted = {name.replace("_", "-"): version for name, version in versions.items()}
+
+    def version(name: str) -> str:
+        if name not in wanted:
+            return real(name)
+        if wanted[name] is None:
+            raise metadata.PackageNotFoundError(name)
+        return str(wanted[name])
+
+    monkeypatch.setattr(metadata, "version", version)
+
+
+def test_wrong_and_missing_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+    installed(monkeypatch, numba="0.70.0", llvmlite=None)
+    found = by_name(doctor.packages())
+    assert (found["numba"].status, found["numba"].remedy) == ("warn", "pip install 'numba==0.68.*'")
+    assert (found["llvmlite"].status, found["llvmlite"].remedy) == ("missing", "pip install 'llvmlite==0.50.*'")
+
+
+@pytest.mark.parametrize(
+    ("version", "specifiers", "answer"),
+    [
+        ("0.68.1", "==0.68.*", True),
+        ("0.69.0", "==0.68.*", False),
+        ("2.4.6", ">=2.0", True),
+        ("1.26.4", ">=2.0", False),
+        ("3.10", ">=3.9,==3.*", True),
+        ("1.0", "", True),
+    ],
+)
+def test_satisfies(version: str, specifiers: str, answer: bool) -> None:
+    assert satisfies(version, specifiers) is answer
+
+
+def test_compiler_without_the_old_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mpmbench.simt.nvrtc.supported_archs", lambda: ["sm_75", "sm_120"])
+    (check,) = doctor.nvrtc()
+    assert check.status == "warn"
+    assert "sm_52" in check.detail
+    assert "12.9" in check.remedy
+
+
+def test_ptxas_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing() -> Path:
+        raise InputError("ptxas not found")
+
+    monkeypatch.setattr("mpmbench.device.ptxas.find_ptxas", missing)
+    (check,) = doctor.ptxas()
+    assert check.status == "missing"
+    assert "nvidia-cuda-nvcc-cu12" in check.remedy
+
+
+def test_cache_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("MPMBENCH_CACHE_DIR", str(tmp_path / "file" / "cache"))
+    found = by_name(doctor.cache_and_disk())
+    assert found["kernel cache"].status == "warn"
+    assert "MPMBENCH_CACHE_DIR" in found["kernel cache"].remedy
+
+
+def test_little_disk_and_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MPMBENCH_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=1000))
+    assert by_name(doctor.cache_and_disk())["disk"].status == "warn"
+    monkeypatch.setattr(doctor, "WANTED_MEMORY", 2**60)
+    assert doctor.memory()[0].status == "warn"
+
+
+def test_no_cupy_and_two_cupys(monkeypatch: pytest.MonkeyPatch) -> None:
+    installed(monkeypatch, cupy_cuda12x=None, cupy_cuda13x=None)
+    assert doctor.cupy()[0].status == "missing"
+    assert "mpmbench[cuda12x]" in doctor.cupy()[0].remedy
+    assert doctor.gpu()[0].status == "missing"
+    installed(monkeypatch, cupy_cuda12x="14.2.0", cupy_cuda13x="14.2.0")
+    assert doctor.cupy()[0].remedy == "keep one of them: pip uninstall cupy-cuda12x"
+    installed(monkeypatch, cupy_cuda12x="15.0.0", cupy_cuda13x=None)
+    assert doctor.cupy()[0].remedy == "pip install 'cupy-cuda12x==14.2.*'"
+
+
+def test_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    machine = FakeGpu()
+    monkeypatch.setitem(sys.modules, "cupy", fake_cupy(machine))
+    assert doctor.gpu() == [Check("cuda:0", "ok", "Fake GPU, sm_90, 1.0 GiB")]
+    machine.count = 0
+    assert doctor.gpu()[0].status == "missing"
+
+
+class NVMLError(Exception):
+    pass
+
+
+def fake_nvml(**changes: Any) -> SimpleNamespace:
+    """The part of pynvml that the doctor asks; names as in nvidia-ml-py 13."""
+    answers: dict[str, Any] = {
+        "NVMLError": NVMLError,
+        "NVML_CLOCK_SM": 1,
+        "NVML_COMPUTEMODE_PROHIBITED": 2,
+        "NVML_COMPUTEMODE_EXCLUSIVE_PROCESS": 3,
+        "nvmlInit": lambda: None,
+        "nvmlShutdown": lambda: None,
+        "nvmlSystemGetDriverVersion": lambda: "580.65",
+        "nvmlDeviceGetCount": lambda: 1,
+        "nvmlDeviceGetHandleByIndex": lambda index: object(),
+        "nvmlDeviceGetName": lambda handle: b"NVIDIA GeForce GTX 970",
+        "nvmlDeviceGetClockInfo": lambda handle, type: 1050,
+        "nvmlDeviceGetMaxClockInfo": lambda handle, type: 1500,
+        "nvmlDeviceGetCudaComputeCapability": lambda handle: (9, 0),
+        "nvmlDeviceGetComputeMode": lambda handle: 0,
+        "nvmlDeviceGetComputeRunningProcesses": lambda handle: [],
+    }
+    return SimpleNamespace(**{**answers, **changes})
+
+
+@pytest.mark.parametrize(
+    ("changes", "what", "status", "remedy"),
+    [
+        ({}, "compute mode", "ok", ""),
+        ({}, "neighbours", "ok", ""),
+        ({"nvmlDeviceGetCudaComputeCapability": lambda handle: (5, 2)}, "clocks", "warn", "one session"),
+        ({"nvmlDeviceGetComputeMode": lambda handle: 2}, "compute mode", "missing", "--compute-mode=0"),
+        (
+            {"nvmlDeviceGetComputeRunningProcesses": lambda handle: [SimpleNamespace(pid=1)]},
+            "neighbours",
+            "warn",
+            "of your own",
+        ),
+    ],
+)
+def test_driver(monkeypatch: pytest.MonkeyPatch, changes, what, status, remedy) -> None:
+    installed(monkeypatch, nvidia_ml_py="13.0")
+    monkeypatch.setitem(sys.modules, "pynvml", fake_nvml(**changes))
+    found = by_name(doctor.driver())
+    assert found["driver"].status == "ok"
+    check = found[f"NVML 0 (NVIDIA GeForce GTX 970): {what}"]
+    assert check.status == status
+    assert remedy in check.remedy
+
+
+@pytest.mark.parametrize(("user", "status"), [(0, "ok"), (1000, "warn")])
+def test_clocks_may_be_locked_by_root_only(monkeypatch: pytest.MonkeyPatch, user: int, status: str) -> None:
+    installed(monkeypatch, nvidia_ml_py="13.0")
+    monkeypatch.setitem(sys.modules, "pynvml", fake_nvml())
+    monkeypatch.setattr("os.geteuid", lambda: user)
+    check = by_name(doctor.driver())["NVML 0 (NVIDIA GeForce GTX 970): clocks"]
+    assert check.status == status
+    assert "--lock-gpu-clocks=1500" in check.detail + check.remedy
+
+
+def test_questions_that_the_driver_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> Any:
+        raise NVMLError("Insufficient Permissions")
+
+    installed(monkeypatch, nvidia_ml_py="13.0")
+    monkeypatch.setitem(sys.modules, "pynvml", fake_nvml(nvmlDeviceGetClockInfo=refuse))
+    found = by_name(doctor.driver())
+    assert found["NVML 0 (NVIDIA GeForce GTX 970): clocks"].detail == "not told: Insufficient Permissions"
+    assert found["NVML 0 (NVIDIA GeForce GTX 970): neighbours"].status == "ok"
+    monkeypatch.setitem(sys.modules, "pynvml", fake_nvml(nvmlInit=refuse))
+    assert doctor.driver()[0].status == "missing"
+    installed(monkeypatch, nvidia_ml_py=None)
+    assert doctor.driver()[0].remedy == "pip install nvidia-ml-py"
