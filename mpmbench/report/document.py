@@ -1,0 +1,344 @@
+"""Records -> what a report says, in the order it says it; Markdown and HTML only spell it.
+
+The answer first, then what needs attention, then the tables and charts it rests on, then where it was made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+
+from mpmbench.errors import InputError
+from mpmbench.measure import SHORTEST_RANKED
+from mpmbench.record import Record
+from mpmbench.report import table as tables
+from mpmbench.report.plots import Bars, Line, Lines, logspace, thin
+from mpmbench.report.table import Group, Kind, Table
+from mpmbench.report.text import number, seconds_text
+
+NOISY = 0.10  # interquartile range over median
+
+KINDS = {
+    Kind.CHECKED: "compared with the float64 reference",
+    Kind.PREDICTED: "follows from sizes or from the compiler, known before anything runs",
+    Kind.SIMULATED: "counted exactly while the CUDA kernel ran on the simulated device; not time",
+    Kind.MEASURED: "event time on a GPU",
+    Kind.MODELLED: "performance model of a named GPU",
+    Kind.PUBLISHED: "printed in the source named, on its GPU",
+}
+
+
+@dataclass(frozen=True)
+class Attention:
+    """Something to know before believing the tables. level: "wrong", "warning" or "note"."""
+
+    level: str
+    text: str
+    action: str
+
+
+@dataclass(frozen=True)
+class Details:
+    """Tables that are folded away."""
+
+    summary: str
+    tables: tuple[Table, ...]
+
+
+@dataclass(frozen=True)
+class Section:
+    title: str
+    tables: tuple[Table, ...] = ()
+    charts: tuple[Bars | Lines, ...] = ()
+    details: tuple[Details, ...] = ()
+    intro: str = ""
+
+
+@dataclass(frozen=True)
+class Document:
+    title: str
+    verdict: str  # one sentence
+    agreed: bool
+    answer: tuple[str, ...]  # more sentences
+    attention: tuple[Attention, ...]
+    sections: tuple[Section, ...]
+    legend: tuple[tuple[str, str, str], ...]  # column, kind, explanation
+    environment: tuple[tuple[str, str], ...]
+    left_out: tuple[str, ...] = field(default=())
+
+
+def build(records: Sequence[Record], detail: int = 3) -> Document:
+    """detail: 3 everything, 2 without hottest lines, 1 without steps either, 0 without charts either."""
+    if not records:
+        raise InputError("no records to report: run something first")
+    records = list(records)
+    groups = tables.group(records)
+    sections = [Section("Answer in one table", tuple(tables.summary(groups)))] if any(g.ranked for g in groups) else []
+    for preset in tables.presets(records):
+        sections.append(Section(preset.title, (replace(preset, title=""),)))
+    sections += [_group_section(g, detail) for g in groups]
+    sections.append(Section("Agreement with the float64 reference", (_untitled(tables.agreement(records)),)))
+    for title, found in (
+        ("Runs without a rank", tables.skipped(records)),
+        ("Findings of the engine", tables.findings(records)),
+        ("Datasets: density and order", tables.datasets(records)),
+        ("Kernels as compiled", tables.kernels(records)),
+    ):
+        if found:
+            sections.append(Section(title, (_untitled(found),)))
+    left_out = ("hottest lines", "single steps", "charts")[: 3 - detail]
+    verdict, agreed = _verdict(records)
+    return Document(
+        title="mpmbench report",
+        verdict=verdict,
+        agreed=agreed,
+        answer=tuple(_answer(groups)),
+        attention=tuple(_attention(records, groups)),
+        sections=tuple(sections),
+        legend=_legend(sections),
+        environment=_environment(records),
+        left_out=left_out,
+    )
+
+
+def _untitled(table: Table) -> Table:
+    return replace(table, title="")
+
+
+# ---- the answer --------------------------------------------------------------------------------------------
+
+
+def _verdict(records: Sequence[Record]) -> tuple[str, bool]:
+    ran = [r for r in records if r.status != "skipped"]
+    wrong = [r for r in ran if r.status != "ok"]
+    strategies = _names(ran)
+    sets = _plural(len({r.dataset.fingerprint for r in ran}), "dataset")
+    if not ran:
+        return f"Nothing ran: all {_plural(len(records), 'run')} were skipped.", False
+    if not wrong:
+        worst = max(r.check.ratio for r in ran if r.check)
+        every = "All" if len(strategies) > 1 else "The"
+        return (
+            f"{every} {_plural(len(strategies), 'strategy', 'strategies')} "
+            f"agree{'' if len(strategies) > 1 else 's'} with the float64 reference "
+            f"({_plural(len(ran), 'run')} on {sets}, worst error {number(worst)} of the allowance).",
+            True,
+        )
+    bad = _names(wrong)
+    return (
+        f"{_plural(len(wrong), 'run')} of {len(ran)} cannot be trusted: "
+        f"{', '.join(bad[:6])}{' and more' if len(bad) > 6 else ''}. The others agree with the float64 reference.",
+        False,
+    )
+
+
+def _names(records: Sequence[Record]) -> list[str]:
+    return list(dict.fromkeys(r.variant for r in records))
+
+
+def _plural(count: int, one: str, many: str = "") -> str:
+    return f"{count:,} {one if count == 1 else many or one + 's'}"
+
+
+def _answer(groups: Sequence[Group]) -> list[str]:
+    sentences = []
+    timed = [g for g in groups if not g.simulated and g.ranked]
+    if not timed:
+        sentences.append(
+            "No GPU took part: every number below is counted on a simulated device, exactly, and is not time. "
+            "Run the same command where there is a GPU for times and speedups."
+        )
+    for g in timed:
+        best, base = g.ranked[0], g.baseline
+        assert best.transfer_measurement is not None
+        words = f"{g.title}, on {g.device}: use {tables.label(best)}, {seconds_text(best.transfer_measurement.median)}"
+        if base is not None and base is not best and base.transfer_measurement is not None:
+            gain = base.transfer_measurement.median / best.transfer_measurement.median
+            words += f", {number(gain)} times as fast as unsorted {base.variant} (transfer alone)"
+        sentences.append(f"{words}.")
+    for transfer in ("p2g", "g2p"):
+        counted = [g for g in groups if g.simulated and g.ranked and g.first.transfer == transfer]
+        for name, counter in (("sectors", tables.sectors), ("warp instructions", tables.warp_inst)):
+            winners: dict[str, int] = {}
+            for g in counted:
+                best = min(g.ranked, key=lambda r: counter(r.transfer_counters.total))  # type: ignore[union-attr]
+                winners[best.variant] = winners.get(best.variant, 0) + 1
+            if winners:
+                who = ", ".join(
+                    f"{variant} ({count} of {len(counted)})" if len(counted) > 1 else variant
+                    for variant, count in sorted(winners.items(), key=lambda item: -item[1])
+                )
+                sentences.append(f"{transfer.upper()}, simulated, not time: fewest {name}: {who}.")
+    return sentences
+
+
+# ---- what needs attention ----------------------------------------------------------------------------------
+
+
+def _attention(records: Sequence[Record], groups: Sequence[Group]) -> list[Attention]:
+    found: list[Attention] = []
+    for r in records:
+        where = f"{tables.label(r)} on {tables.dataset_name(r.dataset)}"
+        if r.status == "wrong":
+            action = f"Do not use it; `mpmbench check -b {r.variant}` shows where it first differs."
+            found.append(Attention("wrong", f"{where}: {tables.reason(r)}.", action))
+        elif r.status == "findings":
+            action = "Its result cannot be relied on; the findings below name the lines."
+            found.append(Attention("wrong", f"{where}: {tables.reason(r)}.", action))
+        elif r.status == "broken":
+            found.append(Attention("wrong", f"{where}: {tables.reason(r)}.", "It has no result and no rank."))
+        elif r.status == "unchecked":
+            action = "Run it with the check on: only checked runs are ranked."
+            found.append(Attention("warning", f"{where} was not checked.", action))
+    reasons: dict[str, int] = {}
+    for r in records:
+        if r.skipped_because:
+            reasons[r.skipped_because] = reasons.get(r.skipped_because, 0) + 1
+    for because, count in reasons.items():
+        text = f"{_plural(count, 'run')} skipped: {because}."
+        found.append(Attention("note", text, "No error: choose other axes or a smaller dataset to run it."))
+    spills = {
+        kernel: info["spill_bytes"]
+        for r in records
+        for kernel, info in r.kernel_info.items()
+        if info.get("spill_bytes")
+    }
+    for kernel, count in spills.items():
+        text = f"Kernel {kernel} spills {count} bytes of registers per thread to local memory."
+        found.append(Attention("warning", text, "A smaller block or less batching needs fewer registers."))
+    for g in groups:
+        if g.ranked and g.baseline is None and len(g.ranked) > 1:
+            name = tables.BASELINES.get(g.first.transfer)
+            text = f"{g.title}: no break-even and no speedup, its baseline did not run."
+            found.append(Attention("note", text, f"Add {name} with particle_order=given."))
+    for r in records:
+        time = r.transfer_measurement
+        if time is None:
+            continue
+        where = f"{tables.label(r)} on {tables.dataset_name(r.dataset)}"
+        if time.median < SHORTEST_RANKED:
+            text = f"{where}: {seconds_text(time.median)} is too short for the resolution of events."
+            found.append(Attention("warning", text, "Do not rank by it; use more particles."))
+        if time.noise > NOISY:
+            text = f"{where}: samples scatter by {100 * time.noise:.0f} % (interquartile range over median)."
+            found.append(Attention("warning", text, "Lock the clocks, free the GPU, and run again."))
+    if any(r.environment.git_dirty for r in records):
+        text = "The code had changes that are in no commit."
+        found.append(Attention("note", text, "Commit them and run again before publishing numbers."))
+    order = {"wrong": 0, "warning": 1, "note": 2}
+    return sorted(dict.fromkeys(found), key=lambda a: order[a.level])
+
+
+# ---- groups ------------------------------------------------------------------------------------------------
+
+
+def _group_section(g: Group, detail: int) -> Section:
+    details = []
+    shown = [tables.ranking(g)]
+    charts: list[Bars | Lines] = []
+    if len(g.ranked) > 1 and detail >= 1:
+        charts = _bars(g) + _break_even_lines(g)
+    if g.ranked:
+        if g.simulated:
+            shown.append(tables.counters(g))
+        shown.append(tables.preprocessing(g))
+    shown = [replace(t, title=t.title.replace(f". {g.title}", "").replace(f": {g.title}", "")) for t in shown]
+    if detail >= 2 and (found := tables.steps(g)):
+        found = [replace(t, title=t.title.replace(f": {g.title}", "")) for t in found]
+        details.append(Details("Each step around the transfer on its own", tuple(found)))
+    if detail >= 3 and g.simulated:
+        hottest = [t for r in g.ranked if (t := tables.hottest_lines(r))]
+        if hottest:
+            summary = "Hottest source lines of each strategy: simulated, not time"
+            details.append(Details(summary, tuple(hottest)))
+    return Section(g.title, tuple(shown), tuple(charts), tuple(details), intro=f"{g.device[0].upper()}{g.device[1:]}.")
+
+
+_BAR_MEASURES = (
+    ("Sectors", "32-byte sectors per particle, transfer alone: simulated, not time", tables.count_of(tables.sectors)),
+    (
+        "Warp instructions",
+        "warp instructions per particle, transfer alone: simulated, not time",
+        tables.count_of(tables.warp_inst),
+    ),
+)
+
+
+def _bars(g: Group) -> list[Bars | Lines]:
+    if not g.simulated:
+        measures = (("Transfer time", "median transfer time [µs], measured", tables.seconds, 1e6),)
+    else:
+        measures = tuple((*m, 1 / (tables.particles(g.first) or 1)) for m in _BAR_MEASURES)  # type: ignore[assignment]
+    charts: list[Bars | Lines] = []
+    for title, axis, measure, scale in measures:
+        costs = [(r, measure(tables.transfer_cost(r))) for r in g.ranked]
+        known = sorted(((r, c * scale) for r, c in costs if c is not None), key=lambda pair: pair[1])
+        if known:
+            baseline = next((i for i, (r, _) in enumerate(known) if r is g.baseline), None)
+            labels = tuple(tables.label(r) + (" (baseline)" if r is g.baseline else "") for r, _ in known)
+            charts.append(Bars(title, axis, labels, tuple(c for _, c in known), baseline))
+    return charts
+
+
+def _break_even_lines(g: Group) -> list[Bars | Lines]:
+    """Cost of a transfer with its share of the sort, over the number of transfers that share one sort."""
+    if not g.simulated:
+        measures = (("time per transfer [µs], measured", tables.seconds, 1e6),)
+    else:
+        scale = 1 / (tables.particles(g.first) or 1)
+        measures = (
+            ("sectors per particle and transfer: simulated", tables.count_of(tables.sectors), scale),
+            ("warp instructions per particle and transfer: simulated", tables.count_of(tables.warp_inst), scale),
+        )  # type: ignore[assignment]
+    x = logspace(1, 1000, 40)
+    charts: list[Bars | Lines] = []
+    for axis, measure, scale in measures:
+        lines = []
+        for r in g.ranked:
+            parts = tables.split(r, measure)
+            if parts is None or parts.per_transfer <= 0:
+                continue
+            y = tuple(scale * (parts.per_sort / k + parts.per_transfer) for k in x)
+            lines.append(Line(tables.label(r), x, y, r is g.baseline))
+        if len(lines) > 1:
+            charts.append(Lines("Transfer with its share of the sort", axis, "transfers per sort", thin(lines)))
+    return charts
+
+
+# ---- legend and environment --------------------------------------------------------------------------------
+
+
+def _legend(sections: Sequence[Section]) -> tuple[tuple[str, str, str], ...]:
+    shown = [t for s in sections for t in (*s.tables, *(t for d in s.details for t in d.tables))]
+    columns = {(c.title, str(c.kind), c.explain): None for t in shown for c in t.columns if c.explain}
+    return tuple(columns)
+
+
+def _environment(records: Sequence[Record]) -> tuple[tuple[str, str], ...]:
+    """One line per fact; where records differ, every value that occurs."""
+    facts: dict[str, dict[str, None]] = {}
+
+    def note(name: str, value: object) -> None:
+        if value is not None and value != "":
+            facts.setdefault(name, {})[str(value)] = None
+
+    for r in records:
+        e = asdict(r.environment)
+        note("device", r.device)
+        note("compiled for", r.arch)
+        for name, value in e.pop("gpu").items():
+            note(f"GPU {name.replace('_', ' ')}", value)
+        note("command", " ".join(e.pop("argv")))
+        dirty = e.pop("git_dirty")
+        commit = e.pop("git_commit")
+        note("commit", f"{commit} with changes" if commit and dirty else commit)
+        for name, value in e.items():
+            note(name.replace("_", " "), value)
+    dates = sorted(facts.get("date", {}))
+    if len(dates) > 2:
+        facts["date"] = {f"{dates[0]} to {dates[-1]}": None}
+    seconds = [r.host_seconds for r in records if r.host_seconds is not None]
+    if seconds:
+        text = f"{sum(seconds):,.1f} s of wall clock for {_plural(len(seconds), 'run')}; says nothing about a GPU"
+        facts["computing time here"] = {text: None}
+    return tuple((name, ", ".join(values)) for name, values in facts.items())
