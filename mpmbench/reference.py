@@ -47,7 +47,7 @@ class Sums:
 
     A result is a sum of terms f(xi) q: weight (or weight times distance) f and quantity q.
     weighted: sum |f q|.  gradient: sum |q| |grad f|, the 1-norm of the gradient by xi.  plain: sum |q| over the support
-    and one node beyond it.  terms: how many particles add to a node (a constant for G2P).
+    and one node beyond it.  terms: how many particles add to a node, or nodes to a particle.
     """
 
     weighted: np.ndarray
@@ -132,7 +132,8 @@ def p2g(dataset: Dataset, spline: str | Spline, payload: str = "pic", dtype: Any
     plain = np.stack(
         [_spread(np.bincount(flat_bin, magnitude[c], minlength=nodes).reshape(shape), spline) for c in range(4)]
     )
-    terms = _spread(np.bincount(flat_bin, minlength=nodes).reshape(shape).astype(np.float64), spline)
+    binned = np.bincount(flat_bin, minlength=nodes).reshape(shape).astype(np.float64)
+    terms = _box_sum(binned, -spline.right, spline.left)
     sums = Sums(weighted.reshape(4, *shape), gradient.reshape(4, *shape), plain, terms)
     return ReferenceNodes(dataset, spline, payload, inputs.dtype, value.reshape(4, *shape), sums, inputs.max_xi)
 
