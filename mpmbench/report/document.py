@@ -17,6 +17,7 @@ from mpmbench.report.table import Group, Kind, Table
 from mpmbench.report.text import number, seconds_text
 
 NOISY = 0.10  # interquartile range over median
+NAMED = 5  # runs (or sentences) of one sort that are spelt out; the tables hold all
 
 KINDS = {
     Kind.CHECKED: "compared with the float64 reference",
@@ -74,9 +75,10 @@ def build(records: Sequence[Record], detail: int = 3) -> Document:
     records = list(records)
     groups = tables.group(records)
     sections = [Section("Answer in one table", tuple(tables.summary(groups)))] if any(g.ranked for g in groups) else []
-    for preset in tables.presets(records):
-        sections.append(Section(preset.title, (replace(preset, title=""),)))
-    sections += [_group_section(g, detail) for g in groups]
+    if published := tables.presets(records):
+        sections.append(Section("Published tables, and the same rows here", tuple(published)))
+    several_devices = len({g.device for g in groups}) > 1
+    sections += [_group_section(g, detail, several_devices) for g in groups]
     sections.append(Section("Agreement with the float64 reference", (_untitled(tables.agreement(records)),)))
     for title, found in (
         ("Runs without a rank", tables.skipped(records)),
@@ -148,14 +150,16 @@ def _answer(groups: Sequence[Group]) -> list[str]:
             "No GPU took part: every number below is counted on a simulated device, exactly, and is not time. "
             "Run the same command where there is a GPU for times and speedups."
         )
-    for g in timed:
+    for g in timed[:NAMED]:
         best, base = g.ranked[0], g.baseline
         assert best.transfer_measurement is not None
-        words = f"{g.title}, on {g.device}: use {tables.label(best)}, {seconds_text(best.transfer_measurement.median)}"
+        words = f"{g.title}, on {g.device}: use {g.label(best)}, {seconds_text(best.transfer_measurement.median)}"
         if base is not None and base is not best and base.transfer_measurement is not None:
             gain = base.transfer_measurement.median / best.transfer_measurement.median
             words += f", {number(gain)} times as fast as unsorted {base.variant} (transfer alone)"
         sentences.append(f"{words}.")
+    if len(timed) > NAMED:
+        sentences.append(f"The table below has {_plural(len(timed) - NAMED, 'more measured case')}.")
     for transfer in ("p2g", "g2p"):
         counted = [g for g in groups if g.simulated and g.ranked and g.first.transfer == transfer]
         for name, counter in (("sectors", tables.sectors), ("warp instructions", tables.warp_inst)):
@@ -176,63 +180,64 @@ def _answer(groups: Sequence[Group]) -> list[str]:
 
 
 def _attention(records: Sequence[Record], groups: Sequence[Group]) -> list[Attention]:
-    found: list[Attention] = []
+    """The same trouble in many runs is one entry that names the first few of them."""
+    found: dict[tuple[str, str, str], list[str]] = {}
+
+    def note(level: str, trouble: str, action: str, where: str = "") -> None:
+        found.setdefault((level, trouble, action), []).append(where)
+
     for r in records:
         where = f"{tables.label(r)} on {tables.dataset_name(r.dataset)}"
         if r.status == "wrong":
             action = f"Do not use it; `mpmbench check -b {r.variant}` shows where it first differs."
-            found.append(Attention("wrong", f"{where}: {tables.reason(r)}.", action))
+            note("wrong", f"{r.variant} gives WRONG RESULTS", action, f"{where}, {tables.reason(r)}")
         elif r.status == "findings":
             action = "Its result cannot be relied on; the findings below name the lines."
-            found.append(Attention("wrong", f"{where}: {tables.reason(r)}.", action))
+            note("wrong", f"{r.variant} was {tables.reason(r)}", action, where)
         elif r.status == "broken":
-            found.append(Attention("wrong", f"{where}: {tables.reason(r)}.", "It has no result and no rank."))
+            note("wrong", tables.reason(r), "It has no result and no rank.", where)
         elif r.status == "unchecked":
-            action = "Run it with the check on: only checked runs are ranked."
-            found.append(Attention("warning", f"{where} was not checked.", action))
-    reasons: dict[str, int] = {}
-    for r in records:
-        if r.skipped_because:
-            reasons[r.skipped_because] = reasons.get(r.skipped_because, 0) + 1
-    for because, count in reasons.items():
-        text = f"{_plural(count, 'run')} skipped: {because}."
-        found.append(Attention("note", text, "No error: choose other axes or a smaller dataset to run it."))
-    spills = {
-        kernel: info["spill_bytes"]
-        for r in records
-        for kernel, info in r.kernel_info.items()
-        if info.get("spill_bytes")
-    }
-    for kernel, count in spills.items():
-        text = f"Kernel {kernel} spills {count} bytes of registers per thread to local memory."
-        found.append(Attention("warning", text, "A smaller block or less batching needs fewer registers."))
+            note("warning", "Not checked", "Run it with the check on: only checked runs are ranked.", where)
+        elif r.status == "skipped":
+            note("note", tables.reason(r), "No error: choose other axes or a smaller dataset to run it.", where)
+        for kernel, info in r.kernel_info.items():
+            if info.get("spill_bytes"):
+                trouble = f"Kernel {kernel} spills {info['spill_bytes']} bytes of registers per thread to local memory"
+                note("warning", trouble, "A smaller block or less batching needs fewer registers.", where)
+        if (time := r.transfer_measurement) is not None:
+            if time.median < SHORTEST_RANKED:
+                trouble = f"Too short for the resolution of events (below {seconds_text(SHORTEST_RANKED)})"
+                note("warning", trouble, "Do not rank by it; use more particles.", where)
+            if time.noise > NOISY:
+                trouble = f"Samples scatter by more than {100 * NOISY:.0f} % (interquartile range over median)"
+                note("warning", trouble, "Lock the clocks, free the GPU, and run again.", where)
     for g in groups:
         if g.ranked and g.baseline is None and len(g.ranked) > 1:
-            name = tables.BASELINES.get(g.first.transfer)
-            text = f"{g.title}: no break-even and no speedup, its baseline did not run."
-            found.append(Attention("note", text, f"Add {name} with particle_order=given."))
-    for r in records:
-        time = r.transfer_measurement
-        if time is None:
-            continue
-        where = f"{tables.label(r)} on {tables.dataset_name(r.dataset)}"
-        if time.median < SHORTEST_RANKED:
-            text = f"{where}: {seconds_text(time.median)} is too short for the resolution of events."
-            found.append(Attention("warning", text, "Do not rank by it; use more particles."))
-        if time.noise > NOISY:
-            text = f"{where}: samples scatter by {100 * time.noise:.0f} % (interquartile range over median)."
-            found.append(Attention("warning", text, "Lock the clocks, free the GPU, and run again."))
+            action = f"Add {tables.BASELINES.get(g.first.transfer)} with particle_order=given."
+            note("note", "No break-even and no speedup, the baseline did not run", action, g.title)
     if any(r.environment.git_dirty for r in records):
-        text = "The code had changes that are in no commit."
-        found.append(Attention("note", text, "Commit them and run again before publishing numbers."))
+        action = "Commit them and run again before publishing numbers."
+        note("note", "The code had changes that are in no commit", action)
+    entries = [
+        Attention(level, trouble[0].upper() + trouble[1:] + _where(places), action)
+        for (level, trouble, action), places in found.items()
+    ]
     order = {"wrong": 0, "warning": 1, "note": 2}
-    return sorted(dict.fromkeys(found), key=lambda a: order[a.level])
+    return sorted(entries, key=lambda a: order[a.level])
+
+
+def _where(places: list[str]) -> str:
+    named = [place for place in dict.fromkeys(places) if place]
+    if not named:
+        return "."
+    more = f"; and {len(named) - NAMED} more" if len(named) > NAMED else ""
+    return f": {'; '.join(named[:NAMED])}{more}."
 
 
 # ---- groups ------------------------------------------------------------------------------------------------
 
 
-def _group_section(g: Group, detail: int) -> Section:
+def _group_section(g: Group, detail: int, name_device: bool) -> Section:
     details = []
     shown = [tables.ranking(g)]
     charts: list[Bars | Lines] = []
@@ -247,11 +252,16 @@ def _group_section(g: Group, detail: int) -> Section:
         found = [replace(t, title=t.title.replace(f": {g.title}", "")) for t in found]
         details.append(Details("Each step around the transfer on its own", tuple(found)))
     if detail >= 3 and g.simulated:
-        hottest = [t for r in g.ranked if (t := tables.hottest_lines(r))]
+        hottest = [t for r in g.ranked if (t := tables.hottest_lines(r, g.label(r)))]
         if hottest:
             summary = "Hottest source lines of each strategy: simulated, not time"
             details.append(Details(summary, tuple(hottest)))
-    return Section(g.title, tuple(shown), tuple(charts), tuple(details), intro=f"{g.device[0].upper()}{g.device[1:]}.")
+    intro = f"{g.device[0].upper()}{g.device[1:]}."
+    if g.shared:
+        intro += f" All runs: {tables.axes_text(g.shared)}."
+    where = ("simulated" if g.simulated else g.device) if name_device else ""
+    title = ", ".join(filter(None, [g.title, where]))
+    return Section(title, tuple(shown), tuple(charts), tuple(details), intro)
 
 
 _BAR_MEASURES = (
@@ -275,7 +285,7 @@ def _bars(g: Group) -> list[Bars | Lines]:
         known = sorted(((r, c * scale) for r, c in costs if c is not None), key=lambda pair: pair[1])
         if known:
             baseline = next((i for i, (r, _) in enumerate(known) if r is g.baseline), None)
-            labels = tuple(tables.label(r) + (" (baseline)" if r is g.baseline else "") for r, _ in known)
+            labels = tuple(g.label(r) + (" (baseline)" if r is g.baseline else "") for r, _ in known)
             charts.append(Bars(title, axis, labels, tuple(c for _, c in known), baseline))
     return charts
 
@@ -299,7 +309,7 @@ def _break_even_lines(g: Group) -> list[Bars | Lines]:
             if parts is None or parts.per_transfer <= 0:
                 continue
             y = tuple(scale * (parts.per_sort / k + parts.per_transfer) for k in x)
-            lines.append(Line(tables.label(r), x, y, r is g.baseline))
+            lines.append(Line(g.label(r), x, y, r is g.baseline))
         if len(lines) > 1:
             charts.append(Lines("Transfer with its share of the sort", axis, "transfers per sort", thin(lines)))
     return charts

@@ -7,7 +7,7 @@ one. Ranks, shares and ratios are of the kind of the numbers they come from.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -44,6 +44,7 @@ class Quantity(StrEnum):
     TEXT = "text"  # a word or two
     PROSE = "prose"  # long enough to need wrapping
     CODE = "code"
+    PRINTED = "printed"  # shown with every digit it has
     COUNT = "count"
     RATE = "rate"  # per second
     NUMBER = "number"
@@ -125,15 +126,24 @@ def _table(
     records: Sequence[Record],
     baseline: Record | None = None,
     notes: Iterable[str] = (),
-    keep_empty: bool = False,
+    shared: Mapping[str, Any] | None = None,
 ) -> Table:
-    """One row per record. Columns that no record can fill are left out."""
+    """One row per record. Columns that no record can fill are left out.
+
+    shared: axes that are said elsewhere; by default those that all rows share, which a note then names.
+    """
+    notes = list(notes)
+    if shared is None:
+        shared = shared_axes(records)
+        notes += [f"All rows: {axes_text(shared)}."] if shared else []
     filled: list[tuple[_Source, list[Any]]] = []
     for source in sources:
-        values = [source.value(record) for record in records]
-        if keep_empty or source.column.kind is Kind.NAME or any(v is not None for v in values):
+        if source is _AXES:
+            values: list[Any] = [axes_text(changed_axes(record, shared)) for record in records]
+        else:
+            values = [source.value(record) for record in records]
+        if any(v is not None and v != "" for v in values):
             filled.append((source, values))
-    filled = [(s, v) for s, v in filled if s.column.kind is not Kind.NAME or any(v)]
     rows = tuple(
         Row(
             tuple(Cell(values[i], source.column.kind) for source, values in filled),
@@ -172,6 +182,14 @@ class Group:
         name = BASELINES.get(self.first.transfer)
         found = [r for r in self.ranked if r.variant == name and r.axes.get("particle_order") == "given"]
         return min(found, key=lambda r: len(changed_axes(r)), default=None)
+
+    @property
+    def shared(self) -> dict[str, Any]:
+        """Changed axes that all its runs share."""
+        return shared_axes(self.records)
+
+    def label(self, record: Record) -> str:
+        return label(record, self.shared)
 
     @property
     def title(self) -> str:
@@ -216,28 +234,35 @@ def _has_cost(record: Record) -> bool:
 # ---- what a record says ------------------------------------------------------------------------------------
 
 
-def changed_axes(record: Record) -> dict[str, Any]:
-    """Axes that are not at this variant's defaults; those of the problem are in the group's title."""
-    if not record.default_axes:
-        return {}
+def changed_axes(record: Record, shared: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Axes that are not at this variant's defaults, less those that are said elsewhere, as the problem is."""
+    said = shared or {}
     return {
         name: value
         for name, value in record.axes.items()
-        if name not in PROBLEM_AXES and record.default_axes.get(name) != value
+        if name not in PROBLEM_AXES and name not in said and record.default_axes.get(name) != value
     }
+
+
+def shared_axes(records: Sequence[Record]) -> dict[str, Any]:
+    """Changed axes that several records all have, with one value: one remark says them for all."""
+    if len(records) < 2:
+        return {}
+    changed = [changed_axes(r) for r in records]
+    return {name: v for name, v in changed[0].items() if all(c.get(name) == v for c in changed)}
 
 
 def axis_text(value: Any) -> str:
     return "x".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
-def axes_text(axes: dict[str, Any]) -> str:
+def axes_text(axes: Mapping[str, Any]) -> str:
     return " ".join(f"{name}={axis_text(value)}" for name, value in axes.items())
 
 
-def label(record: Record) -> str:
+def label(record: Record, shared: Mapping[str, Any] | None = None) -> str:
     """Variant with its changed axes: unique within a group."""
-    return " ".join(filter(None, [record.variant, axes_text(changed_axes(record))]))
+    return " ".join(filter(None, [record.variant, axes_text(changed_axes(record, shared))]))
 
 
 def problem_text(record: Record) -> str:
@@ -497,7 +522,7 @@ def ranking(g: Group) -> Table:
         _MEMORY,
     ]
     title = f"Ranking by sectors and by warp instructions: simulated, not time. {g.title}"
-    return _table(title, sources, g.records, base, (WHY_RANKS_DISAGREE, *_baseline_note(base, g)))
+    return _table(title, sources, g.records, base, (WHY_RANKS_DISAGREE, *_baseline_note(base, g)), g.shared)
 
 
 def counters(g: Group) -> Table:
@@ -506,7 +531,7 @@ def counters(g: Group) -> Table:
         _STRATEGY, _AXES, _LANES_PER_VISIT, _WARP_INST, _REQUESTS, _SECTORS, _BYTES, _FLOOR, _WAVEFRONTS,
         _GLOBAL_ATOMICS, _GLOBAL_MULTIPLICITY, _SHARED_ATOMICS, _SHARED_MULTIPLICITY, _BARRIERS, _DIVERGENT, _LOCAL,
     ]  # fmt: skip
-    return _table(f"Transfer alone, counted: {g.title}", sources, g.ranked, g.baseline)
+    return _table(f"Transfer alone, counted: {g.title}", sources, g.ranked, g.baseline, (), g.shared)
 
 
 def preprocessing(g: Group) -> Table:
@@ -544,8 +569,8 @@ def preprocessing(g: Group) -> Table:
             )
         )  # fmt: skip
     return _table(
-        f"Preprocessing beside transfer: {g.title}", sources, g.ranked, base, _baseline_note(base, g)
-    )  # fmt: skip
+        f"Preprocessing beside transfer: {g.title}", sources, g.ranked, base, _baseline_note(base, g), g.shared
+    )
 
 
 def _of_split(measure: Measure, pick: Callable[[Split], float], per_particle: bool) -> Callable[[Record], float | None]:
@@ -560,7 +585,7 @@ def _of_split(measure: Measure, pick: Callable[[Split], float], per_particle: bo
 
 def _baseline_note(base: Record | None, g: Group) -> tuple[str, ...]:
     if base is not None:
-        return (f"Baseline of the break-even: {label(base)}, particles in the order given.",)
+        return (f"Baseline of the break-even: {g.label(base)}, particles in the order given.",)
     name = BASELINES.get(g.first.transfer)
     return (f"No break-even: {name} with particle_order=given did not run on this dataset.",) if name else ()
 
@@ -588,6 +613,9 @@ def steps(g: Group) -> list[Table]:
                 *(_Source(Column(n, kind, quantity), _of_step(n, measure, per_particle)) for n in names),
             ],
             records,
+            g.baseline,
+            (),
+            g.shared,
         )
         for title, measure, kind, quantity, per_particle in measures
     ]
@@ -607,7 +635,9 @@ def measured(g: Group) -> Table:
     base = g.baseline
     base_seconds = base and seconds(transfer_cost(base))
 
-    def timed(title: str, value: Callable[[Record], Any], quantity: Quantity, better: str, explain: str) -> _Source:
+    def timed(
+        title: str, value: Callable[[Record], Any], quantity: Quantity, better: str | None, explain: str
+    ) -> _Source:
         return _Source(Column(title, Kind.MEASURED, quantity, better, explain), value)
 
     def of_time(pick: Callable[[Record, float], float]) -> Callable[[Record], float | None]:
@@ -630,7 +660,7 @@ def measured(g: Group) -> Table:
             "noise",
             lambda r: r.transfer_measurement and r.transfer_measurement.noise,
             Quantity.SHARE,
-            "less",
+            None,
             "interquartile range over median",
         ),
         timed("ns / node visit", of_time(lambda r, t: 1e9 * t / r.node_visits), Quantity.NUMBER, "less",
@@ -638,13 +668,13 @@ def measured(g: Group) -> Table:
         timed("particles / s", of_time(lambda r, t: r.dataset.n / t), Quantity.RATE, "more", "throughput"),
         timed("speedup", of_time(lambda r, t: (base_seconds or math.nan) / t) if base_seconds else lambda r: None,
               Quantity.FACTOR, "more", "baseline's time over this one's, transfer alone"),
-        timed("preprocessing", before, Quantity.SECONDS, "less", "median times of its steps, added up"),
+        timed("preprocessing", before, Quantity.SECONDS, None, "median times of its steps, added up"),
         timed("break-even", _break_even(seconds, base), Quantity.TRANSFERS, "less",
               "transfers per sort after which preprocessing has paid for itself"),
         _MEMORY,
     ]  # fmt: skip
     title = f"Ranking by measured time. {g.title}"
-    return _table(title, sources, g.records, base, _baseline_note(base, g))
+    return _table(title, sources, g.records, base, _baseline_note(base, g), g.shared)
 
 
 def transfer_cost(record: Record) -> StepCost:
@@ -654,7 +684,7 @@ def transfer_cost(record: Record) -> StepCost:
 # ---- hottest lines -----------------------------------------------------------------------------------------
 
 
-def hottest_lines(record: Record, count: int = HOTTEST_LINES) -> Table | None:
+def hottest_lines(record: Record, name: str, count: int = HOTTEST_LINES) -> Table | None:
     """The source lines that cost most: the first few by warp instructions and the first few by sectors."""
     if record.transfer_counters is None or not record.transfer_counters.lines:
         return None
@@ -687,7 +717,7 @@ def hottest_lines(record: Record, count: int = HOTTEST_LINES) -> Table | None:
             tally.sectors / total.sectors if total.sectors else None,
         )
         rows.append(Row(tuple(Cell(v, c.kind) for v, c in zip(values, columns, strict=True))))
-    return Table(f"Hottest lines: {label(record)}", columns, tuple(rows))
+    return Table(f"Hottest lines: {name}", columns, tuple(rows))
 
 
 # ---- across groups -----------------------------------------------------------------------------------------
@@ -696,10 +726,10 @@ def hottest_lines(record: Record, count: int = HOTTEST_LINES) -> Table | None:
 def summary(groups: Sequence[Group]) -> list[Table]:
     """One row per group: who wins, and by how much. Simulated and measured groups stand in tables of their own."""
     tables = []
-    if counted := [g for g in groups if g.simulated and g.ranked]:
-        tables.append(_summary(counted, (("sectors", sectors), ("warp instructions", warp_inst))))
     if timed := [g for g in groups if not g.simulated and g.ranked]:
         tables.append(_summary_measured(timed))
+    if counted := [g for g in groups if g.simulated and g.ranked]:
+        tables.append(_summary(counted, (("sectors", sectors), ("warp instructions", warp_inst))))
     return tables
 
 
@@ -736,7 +766,7 @@ def _summary(groups: Sequence[Group], by: Sequence[tuple[str, Callable[[Tally], 
             best = min(g.ranked, key=lambda r: counter(r.transfer_counters.total))  # type: ignore[union-attr]
             count = counter(best.transfer_counters.total)  # type: ignore[union-attr]
             base = g.baseline and counter(g.baseline.transfer_counters.total)  # type: ignore[union-attr]
-            values += [label(best), count / (particles(best) or 1), base / count if base and count else None]
+            values += [g.label(best), count / (particles(best) or 1), base / count if base and count else None]
         rows.append(_row(values + _after(g), columns))
     return Table("Fewest sectors and fewest warp instructions: simulated, not time", tuple(columns), tuple(rows))
 
@@ -757,7 +787,7 @@ def _summary_measured(groups: Sequence[Group]) -> Table:
         time = seconds(transfer_cost(best))
         base_time = base and seconds(transfer_cost(base))
         speedup = base_time / time if base_time and time else None
-        values = [label(best), time, speedup, _break_even(seconds, base)(best)]
+        values = [g.label(best), time, speedup, _break_even(seconds, base)(best)]
         rows.append(_row([*_before(g), *values, *_after(g), g.device], columns))
     return Table("Fastest transfer, measured", columns, tuple(rows))
 
@@ -888,6 +918,10 @@ def _preset(record: Record, key: str) -> Any:
     return (record.preset_row or {}).get(key)
 
 
+def _other_printed(name: str) -> Callable[[Record], Any]:
+    return lambda record: (_preset(record, "published") or {}).get(name)
+
+
 def _published(records: list[Record]) -> Table:
     """Rows in printed order. A row printed without a speedup is the baseline of those after it."""
     speedups_printed = any(_preset(r, "published_speedup") is not None for r in records)
@@ -908,12 +942,10 @@ def _published(records: list[Record]) -> Table:
 
         return value
 
-    def published(title: str, key: str, quantity: Quantity, scale: float, explain: str) -> _Source:
-        def value(record: Record) -> float | None:
-            number = _preset(record, key)
-            return None if number is None else number * scale
+    def published(title: str, value: Callable[[Record], Any]) -> _Source:
+        return _Source(Column(title, Kind.PUBLISHED, Quantity.PRINTED, explain="as printed"), value)
 
-        return _Source(Column(title, Kind.PUBLISHED, quantity, explain=explain), value)
+    others = dict.fromkeys(name for r in records for name in _preset(r, "published") or ())
 
     def ours(title: str, kind: Kind, value: Callable[[Record], Any], quantity: Quantity, explain: str) -> _Source:
         return _Source(Column(title, kind, quantity, explain=explain), value)
@@ -922,21 +954,21 @@ def _published(records: list[Record]) -> Table:
     where = _Source(Column("dataset", Kind.NAME, Quantity.CODE), lambda r: dataset_name(r.dataset) if several else "")
     row = _Source(Column("row as printed", Kind.NAME, Quantity.PROSE), lambda r: str(_preset(r, "row")))
     sources = [
-        row, where, _STRATEGY, _AXES,
-        published("time", "published_us", Quantity.SECONDS, 1e-6, "as printed"),
-        published("speedup", "published_speedup", Quantity.FACTOR, 1, "as printed"),
+        row, where, _STRATEGY, _AXES, _REMARK,
+        published("time [µs]", lambda r: _preset(r, "published_us")),
+        published("speedup", lambda r: _preset(r, "published_speedup")),
         _AGREEMENT, _SECTORS, _WARP_INST,
-        ours("fewer sectors", Kind.SIMULATED, against(count_of(sectors)), Quantity.FACTOR,
+        ours("sectors, baseline / this", Kind.SIMULATED, against(count_of(sectors)), Quantity.FACTOR,
              "sectors of the printed table's baseline over this row's; not a speedup"),
-        ours("fewer warp inst", Kind.SIMULATED, against(count_of(warp_inst)), Quantity.FACTOR,
+        ours("warp inst, baseline / this", Kind.SIMULATED, against(count_of(warp_inst)), Quantity.FACTOR,
              "warp instructions of the printed table's baseline over this row's; not a speedup"),
         ours("transfer", Kind.MEASURED, lambda r: seconds(transfer_cost(r)), Quantity.SECONDS,
              "median event time on this GPU"),
         ours("speedup here", Kind.MEASURED, against(seconds), Quantity.FACTOR, "on this GPU"),
-        _REMARK,
+        *(published(name.replace("_", " ").replace(" percent", " [%]"), _other_printed(name)) for name in others),
     ]  # fmt: skip
     errata = [f"{_preset(r, 'row')}: {erratum}" for r in records if (erratum := _preset(r, "erratum"))]
-    source = _preset(records[0], "source") or "Thesis"
+    source = str(_preset(records[0], "source") or "published").capitalize()
     return _table(
         f"{source}, table {_preset(records[0], 'table')}: {records[0].transfer.upper()} on {records[0].dataset.name}",
         sources, records, None, [f"Erratum. {text}" for text in dict.fromkeys(errata)],

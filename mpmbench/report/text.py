@@ -20,6 +20,8 @@ def format_value(value: Any, quantity: Quantity) -> str:
     match quantity:
         case Quantity.TEXT | Quantity.PROSE | Quantity.CODE | Quantity.RANK:
             return str(value)
+        case Quantity.PRINTED:
+            return f"{value:,.10g}"
         case Quantity.COUNT:
             return f"{value:,.0f}"
         case Quantity.BYTES:
