@@ -223,7 +223,7 @@ def list_command(variant_dirs: Sequence[Path], as_json: bool) -> None:
 
 
 def _axis_values(variant: Any) -> dict[str, list[Any]]:
-    return {name: list(axis.values) for name, axis in variant.axes.items()}
+    return {name: list(values) for name, values in variant.axes.items()}
 
 
 @main.command()
@@ -300,7 +300,7 @@ def check(
 def report(records: Sequence[Path], html_path: Path | None, md_path: Path | None, csv_path: Path | None) -> None:
     """Rebuild a report from RECORDS files, on any machine. Prints Markdown if no file is named."""
     from mpmbench.record import read_records
-    from mpmbench.report.markdown import markdown_report
+    from mpmbench.report import markdown_text
 
     rows = [row for path in records for row in read_records(path)]
     if not rows:
@@ -311,7 +311,7 @@ def report(records: Sequence[Path], html_path: Path | None, md_path: Path | None
         for path in filter(None, (html_path, md_path, csv_path)):
             console.print(f"wrote {path}", markup=False, soft_wrap=True)
     else:
-        click.echo(markdown_report(rows))
+        click.echo(markdown_text(rows))
 
 
 @main.command()

@@ -22,7 +22,7 @@ from mpmbench.environment import Environment
 from mpmbench.errors import InputError
 from mpmbench.measure import Sampling, measure_plan
 from mpmbench.record import Check, DatasetSummary, Record, StepCost, line_texts
-from mpmbench.reference import Nodes, divide, g2p, p2g
+from mpmbench.reference import Nodes, ReferenceNodes, ReferenceParticles, g2p, grid_divide, p2g
 from mpmbench.variants import Variant, resolve_axes, why_impossible
 
 
@@ -95,33 +95,25 @@ class Inputs:
             self.choice, self.dataset = choice, choice.load()
         return self.dataset
 
-    def nodes(self, axes: Mapping[str, Any]) -> Any:
+    def nodes(self, axes: Mapping[str, Any]) -> ReferenceNodes:
         """The reference P2G for these axes."""
-        return self._cached(
-            ("p2g", axes["spline"], axes["payload"], axes["dtype"]),
-            lambda dataset: p2g(dataset, axes["spline"], axes["payload"], axes["dtype"]),
-        )
+        return self._cached("p2g", axes, lambda dataset, *how: p2g(dataset, *how))
 
-    def node_velocity(self, axes: Mapping[str, Any]) -> Nodes:
-        """Mass and velocity per node: what every G2P reads, from the reference P2G."""
-        return self._cached(
-            ("velocity", axes["spline"], axes["payload"], axes["dtype"]), lambda _: divide(self.nodes(axes).nodes)
-        )
+    def rounded_nodes(self, axes: Mapping[str, Any]) -> Nodes:
+        """What every G2P starts from: the reference P2G as the kernels' number type holds it."""
+        nodes, real = self.nodes(axes).nodes, np.dtype(axes["dtype"])
+        return Nodes(nodes.mass.astype(real), nodes.momentum.astype(real))
 
-    def particles(self, axes: Mapping[str, Any]) -> Any:
-        """The reference G2P for these axes, on ``node_velocity``."""
-        return self._cached(
-            ("g2p", axes["spline"], axes["payload"], axes["dtype"]),
-            lambda dataset: g2p(
-                dataset, self.node_velocity(axes), axes["spline"], axes["payload"], axes["dtype"]
-            ),
-        )
+    def particles(self, axes: Mapping[str, Any]) -> ReferenceParticles:
+        """The reference G2P for these axes, from ``rounded_nodes``."""
+        return self._cached("g2p", axes, lambda dataset, *how: g2p(dataset, grid_divide(self.rounded_nodes(axes)), *how))
 
-    def _cached(self, key: tuple[Any, ...], make: Callable[[Dataset], Any]) -> Any:
+    def _cached(self, transfer: str, axes: Mapping[str, Any], make: Callable[..., Any]) -> Any:
         assert self.dataset is not None
-        if key not in self.references:
-            self.references[key] = make(self.dataset)
-        return self.references[key]
+        how = (axes["spline"], axes["payload"], axes["dtype"])
+        if (transfer, *how) not in self.references:
+            self.references[transfer, *how] = make(self.dataset, *how)
+        return self.references[transfer, *how]
 
 
 def run_case(
@@ -163,7 +155,7 @@ def _run(
     variant, axes, dataset = case.variant, case.axes, inputs.dataset
     assert dataset is not None
     dataset.check_support(axes["spline"], np.dtype(axes["dtype"]))
-    nodes = inputs.node_velocity(axes) if variant.transfer == "g2p" else None
+    nodes = inputs.rounded_nodes(axes) if variant.transfer == "g2p" else None
     plan = planning.build_plan(variant, dataset, device, axes, nodes=nodes)
     preprocess, transfer, finish = plan.run_once(device)
     check = check_outputs(plan.outputs(), variant.transfer, inputs, axes)

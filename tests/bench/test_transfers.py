@@ -75,5 +75,5 @@ def test_cuda(request, device_clock, variant, choice):
 
 def _plan(case, device, inputs):
     dataset = inputs.select(case.dataset)
-    nodes = inputs.node_velocity(case.axes) if case.variant.transfer == "g2p" else None
+    nodes = inputs.rounded_nodes(case.axes) if case.variant.transfer == "g2p" else None
     return build_plan(case.variant, dataset, device, case.axes, nodes=nodes)

@@ -1,0 +1,201 @@
+"""The command line as a user meets it: what it prints, what it leaves behind, how it refuses."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from mpmbench.cli import main
+from mpmbench.record import read_records
+
+SMALL = ["--dataset", "random", "--particles", "500", "-d", "simulated"]
+
+
+def invoke(*words, code=0):
+    result = CliRunner().invoke(main, [str(word) for word in words])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+def refusal(*words):
+    """The one line of a refused command: exit code 2, nothing else printed."""
+    lines = invoke(*words, code=2).strip().splitlines()
+    assert len(lines) == 1, lines
+    assert lines[0].startswith("mpmbench: ")
+    return lines[0]
+
+
+def test_list_names_everything():
+    text = invoke("list")
+    for name in ("p2g_block_sync", "g2p_global_gather", "uniform_cube", "thesis", "simulated", "batching"):
+        assert name in text
+    content = json.loads(invoke("list", "--json"))
+    assert content["variants"]["p2g_block_sync"]["axes"]["batching"] == [1, 2, 4, 8]
+
+
+def test_run_leaves_records_and_reports(tmp_path):
+    files = [tmp_path / name for name in ("rows.jsonl", "report.html", "report.md", "rows.csv")]
+    invoke("run", *SMALL, "-b", "p2g_block_sync", "-a", "batching=[1,2]", "--json", files[0], "--html", files[1],
+           "--md", files[2], "--csv", files[3])  # fmt: skip
+    records = read_records(files[0])
+    assert [r.axes["batching"] for r in records] == [1, 2]
+    assert all(r.status == "ok" and r.transfer_counters.total.bar > 0 for r in records)
+    assert "<html" in files[1].read_text()
+    assert "p2g_block_sync" in files[2].read_text()
+    assert len(files[3].read_text().splitlines()) == 3
+
+
+def test_report_is_rebuilt_from_records(tmp_path):
+    rows = tmp_path / "rows.jsonl"
+    invoke("run", *SMALL, "-b", "g2p_global_gather", "--json", rows)
+    assert "g2p_global_gather" in invoke("report", rows)
+    invoke("report", rows, "--html", tmp_path / "again.html")
+    assert (tmp_path / "again.html").stat().st_size < 1 << 20
+
+
+def test_resume_runs_only_what_is_missing(tmp_path):
+    rows = tmp_path / "rows.jsonl"
+    invoke("run", *SMALL, "-b", "p2g_global_atomic", "--json", rows)
+    before = rows.read_bytes()
+    invoke("run", *SMALL, "-b", "p2g_global_*", "--json", rows, "--resume")
+    assert rows.read_bytes().startswith(before)
+    assert [r.variant for r in read_records(rows)] == ["p2g_global_atomic", "p2g_global_node"]
+
+
+def test_own_particles(tmp_path):
+    path = tmp_path / "mine.npz"
+    position = np.random.default_rng(3).uniform(0.2, 0.6, (60, 3))
+    np.savez(path, position=position, velocity=position, mass=1.0, grid_shape=(16, 16, 16), dx=1 / 16)
+    invoke("run", "--dataset", path, "-b", "p2g_*", "-d", "simulated", "--json", tmp_path / "rows.jsonl")
+    assert {r.dataset.n for r in read_records(tmp_path / "rows.jsonl")} == {60}
+
+
+def test_dry_run_runs_nothing(tmp_path):
+    out = invoke("run", "--preset", "thesis", "-d", "simulated", "--dry-run", "--json", tmp_path / "rows.jsonl")
+    assert "32 rows" in out
+    assert not (tmp_path / "rows.jsonl").exists()
+
+
+def test_impossible_combination_is_a_row_with_a_reason(tmp_path):
+    rows = tmp_path / "rows.jsonl"
+    invoke("run", *SMALL, "-b", "p2g_block_*", "-a", "block_shape=32x32x32", "--json", rows)
+    assert {r.status for r in read_records(rows)} == {"skipped"}
+    assert all("32x32x32 needs 32768 threads" in r.skipped_because for r in read_records(rows))
+
+
+def test_check_debug_reports_agreement():
+    out = invoke("check", *SMALL, "-b", "p2g_block_sync", "--debug")
+    assert "1 rows: 1 ok" in out
+
+
+def test_env_and_doctor():
+    assert "numpy" in invoke("env")
+    assert "NVRTC" in invoke("doctor")
+
+
+# --- refusals ---------------------------------------------------------------------------------------------------------
+
+
+def test_unknown_names_list_the_valid_ones():
+    assert "p2g_block_sync" in refusal("run", "-b", "p2g_nothing", "-d", "simulated")
+    assert "uniform_cube" in refusal("run", "--dataset", "nothing", "-d", "simulated")
+    assert "batching" in refusal("run", "-a", "nothing=1", "-d", "simulated")
+    assert "1, 2, 4, 8" in refusal("run", "-b", "p2g_block_sync", "-a", "batching=3", "-d", "simulated")
+    assert "thesis" in refusal("run", "--preset", "nothing", "-d", "simulated")
+    assert "simulated" in refusal("run", "-d", "nothing")
+    assert "name=value" in refusal("run", "-a", "batching", "-d", "simulated")
+
+
+@pytest.mark.skipif(os.path.exists("/proc/driver/nvidia"), reason="there is a GPU here")
+def test_no_gpu():
+    assert "simulated" in refusal("run", "-d", "cuda", "-b", "p2g_global_atomic")
+
+
+def test_missing_and_malformed_files(tmp_path):
+    assert "missing.npz" in refusal("run", "--dataset", tmp_path / "missing.npz", "-d", "simulated")
+    bad = tmp_path / "bad.npz"
+    bad.write_bytes(b"not a zip file")
+    assert "bad.npz" in refusal("run", "--dataset", bad, "-d", "simulated")
+    assert "missing.jsonl" in refusal("report", tmp_path / "missing.jsonl")
+    (tmp_path / "bad.jsonl").write_text("{}\n{}\n")
+    assert "bad.jsonl" in refusal("report", tmp_path / "bad.jsonl")
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"position": np.full((4, 3), np.nan)}, "particle 0"),
+        ({"position": np.full((4, 3), 7.0)}, "outside"),
+        ({"velocity": np.zeros((3, 3))}, "(4, 3)"),
+        ({"velocity": np.array([["a"] * 3] * 4)}, "velocity"),
+        ({"mass": -1.0}, "mass"),
+        ({"dx": 0.0}, "dx"),
+    ],
+)
+def test_bad_particles(tmp_path, change, expected):
+    good = {
+        "position": np.full((4, 3), 0.5),
+        "velocity": np.zeros((4, 3)),
+        "mass": 1.0,
+        "grid_shape": (8, 8, 8),
+        "dx": 1 / 8,
+    }
+    path = tmp_path / "particles.npz"
+    np.savez(path, **good | change)
+    line = refusal("run", "--dataset", path, "-d", "simulated", "--json", tmp_path / "rows.jsonl")
+    assert expected in line
+    assert not (tmp_path / "rows.jsonl").exists()
+
+
+def test_nothing_is_overwritten_by_a_refused_run(tmp_path):
+    rows = tmp_path / "rows.jsonl"
+    rows.write_text("keep me")
+    refusal("run", "--dataset", "nothing", "-d", "simulated", "--json", rows)
+    assert rows.read_text() == "keep me"
+
+
+def test_folder_in_place_of_a_file(tmp_path):
+    assert "folder" in refusal("run", *SMALL, "--html", tmp_path)
+
+
+def test_full_disk(tmp_path):
+    """/dev/full fails every write with "no space left on device"."""
+    (tmp_path / "rows.jsonl").symlink_to("/dev/full")
+    assert "space" in refusal("run", *SMALL, "-b", "p2g_global_atomic", "--json", tmp_path / "rows.jsonl")
+
+
+# --- interruption -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_interrupted_run_keeps_finished_rows(tmp_path, how):
+    rows = tmp_path / "rows.jsonl"
+    words = ["run", "--dataset", "random", "--particles", "3000", "-d", "simulated", "-b", "p2g_global_*",
+             "-a", "dtype=[float32,float64]", "-a", "layout=[soa,aos]", "-a", "weights=[plain,unity]"]  # fmt: skip
+    command = [sys.executable, "-m", "mpmbench", *words, "--json", str(rows)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 120
+    while not (rows.exists() and rows.read_bytes().count(b"\n") >= 2):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    process.send_signal(how)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode in (130, -how)
+    assert "Traceback" not in errors
+    kept = rows.read_bytes().count(b"\n")
+    assert 2 <= kept < 16
+    invoke(*words, "--json", rows, "--resume")
+    records = read_records(rows)
+    assert len(records) == 16
+    assert len({tuple(sorted(map(str, r.axes.items()))) + (r.variant,) for r in records}) == 16
