@@ -9,14 +9,14 @@ from __future__ import annotations
 import hashlib
 import tomllib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mpmbench import recipes
+from mpmbench import density, particle_file, recipes
 from mpmbench.errors import InputError
 from mpmbench.grid import Grid
 from mpmbench.spline import Spline, get_spline
@@ -86,7 +86,7 @@ class Dataset:
             if array.shape != shape:
                 raise InputError(f"{where}: {label} has shape {array.shape}, want {shape} as position has {n} rows")
         for array, label in ((position, "position"), (velocity, "velocity"), (mass, "mass"), (affine, "affine")):
-            finite = np.isfinite(array).reshape(n, -1).all(axis=1)
+            finite = np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
             if not finite.all():
                 p = int(np.argmin(finite))
                 raise InputError(f"{where}: {label} of particle {p} is not finite: {array[p].tolist()}")
@@ -108,6 +108,16 @@ class Dataset:
         for array in (self.position, self.velocity, self.affine, self.mass):
             digest.update(np.ascontiguousarray(array, dtype="<f8").data)
         return digest.hexdigest()
+
+    @cached_property
+    def statistics(self) -> dict[str, Any]:
+        """Density and order of the particles, by name; see ``density.statistics``."""
+        return density.statistics(self.node_units(), self.grid)
+
+    @property
+    def particles_per_cell(self) -> float:
+        """Mean over the cells that hold particles."""
+        return self.statistics["mean_per_occupied_cell"]
 
     def node_units(self, dtype: Any = np.float64) -> np.ndarray:
         """(n, 3) xi = (x - origin) / dx as kernels compute it: inputs and each operation rounded to ``dtype``."""
@@ -178,10 +188,6 @@ def load_dataset(
 
     What is left out takes the recipe's or file's own value; a parameter that the recipe does not have is an InputError.
     """
-    recipe = next((r for r in list_datasets() if r.name == str(name_or_path)), None)
-    if recipe is None:
-        names = ", ".join(r.name for r in list_datasets())
-        raise InputError(f"unknown dataset {str(name_or_path)!r}: valid are {names}, or a path to a .npz or .npy file")
     given = {
         "particles": particles,
         "particles_per_cell": particles_per_cell,
@@ -190,14 +196,26 @@ def load_dataset(
         "dx": dx,
         "origin": origin,
     }
-    parameters = dict(recipe.parameters)
-    for key, value in given.items():
-        if value is None:
-            continue
-        if key not in parameters:
-            raise InputError(f"dataset {recipe.name!r} has no parameter {key!r}: it has {', '.join(parameters)}")
-        parameters[key] = value
-    return _generate(recipe.name, parameters)
+    given = {key: value for key, value in given.items() if value is not None}
+    name = str(name_or_path)
+    recipe = next((r for r in list_datasets() if r.name == name), None)
+    if recipe is not None:
+        parameters = recipe.parameters
+        if unknown := given.keys() - parameters.keys():
+            raise InputError(f"dataset {name!r} has no parameter {min(unknown)!r}: it has {', '.join(parameters)}")
+    elif Path(name).suffix in particle_file.SUFFIXES:
+        if unknown := given.keys() & {"seed", "particles_per_cell"}:
+            raise InputError(f"file {name!r} has no parameter {min(unknown)!r}: it is data, not a recipe")
+        parameters = {"kind": "file", "file": name, "order": "given"}
+    else:
+        names = ", ".join(r.name for r in list_datasets())
+        raise InputError(f"unknown dataset {name!r}: valid are {names}, or a path to a .npz or .npy file")
+    parameters = parameters | given
+    for key, least in (("particles", 0), ("particles_per_cell", 1), ("seed", 0)):
+        value = parameters.get(key, least)
+        if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
+            raise InputError(f"dataset {name!r}: {key} is {value!r}; it must be a whole number of at least {least}")
+    return (_from_file if parameters["kind"] == "file" else _generate)(name, parameters)
 
 
 def _read_recipe(path: Path) -> Recipe:
@@ -213,10 +231,6 @@ def _generate(name: str, recipe: dict[str, Any]) -> Dataset:
     over a support they change the velocity by about as much as its size. Masses differ by up to a factor of three,
     about one kilogram in all, so that a mixed-up particle shows.
     """
-    for key, least in (("particles", 0), ("particles_per_cell", 1), ("seed", 0)):
-        value = recipe.get(key, least)
-        if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
-            raise InputError(f"dataset {name!r}: {key} is {value!r}; it must be a whole number of at least {least}")
     grid = make_grid(recipe["grid_shape"], recipe["dx"], recipe["origin"], where=name)
     recipe = recipe | {"grid_shape": list(grid.shape), "dx": grid.dx, "origin": list(grid.origin)}
     uniform = recipes.Uniform(int(recipe["seed"]))
@@ -236,6 +250,44 @@ def _generate(name: str, recipe: dict[str, Any]) -> Dataset:
         order=recipe["order"],
         seed=int(recipe["seed"]),
         recipe=recipe,
+    )
+
+
+def _from_file(name: str, recipe: dict[str, Any]) -> Dataset:
+    """The particles of a file, or as many of them, evenly spaced, as the recipe asks for.
+
+    padding: empty layers of nodes that the recipe adds on every side of the file's grid.
+    """
+    path = Path(recipe["file"])
+    shipped = name != recipe["file"]
+    arrays = particle_file.read(DATASETS_FOLDER / path if shipped else path)
+    arrays |= {key: recipe[key] for key in ("grid_shape", "dx", "origin") if key in recipe}
+    for key, meaning in (("grid_shape", "nodes per axis"), ("dx", "the spacing [m]")):
+        if key not in arrays:
+            raise InputError(f"file {name!r} has no {key!r}: add {meaning} to the .npz, or give {key}=...")
+    shape, dx, origin = np.asarray(arrays.pop("grid_shape")), arrays.pop("dx"), arrays.pop("origin", (0.0, 0.0, 0.0))
+    grid = make_grid(np.broadcast_to(shape, 3) if shape.ndim == 0 else shape, dx, origin, where=name)
+    padding = recipe.get("padding", 0)
+    available = len(arrays["position"]) if np.ndim(arrays["position"]) else 0
+    count = recipe.get("particles", available)
+    if count > available:
+        raise InputError(f"dataset {name!r} has {available} particles, not {count}: ask for at most as many")
+    chosen = np.arange(count) * available // max(count, 1)
+    whole = Dataset.from_arrays(
+        **arrays,
+        grid_shape=[n + 2 * padding for n in grid.shape],
+        dx=grid.dx,
+        origin=[corner - padding * grid.dx for corner in grid.origin],
+        name=name if shipped else path.name,
+        order=recipe["order"],
+    )
+    return replace(
+        whole,
+        position=whole.position[chosen],
+        velocity=whole.velocity[chosen],
+        affine=whole.affine[chosen],
+        mass=whole.mass[chosen],
+        recipe=recipe | {"particles": count},
     )
 
 
