@@ -63,10 +63,12 @@ def binning(work: Workspace) -> Step:
 def bin_scan(work: Workspace) -> Step:
     """Counts of bins to the first sorted particle of each."""
     bins = bin_count(work.grid, work.axes) + 1
-    return Step("scan", _scan(work, "bin_scan", bins, work.buffers["bin_count"], work.bin_start, flags=False))
+    return Step("scan", scan_launches(work, "bin_scan", bins, work.buffers["bin_count"], work.bin_start, flags=False))
 
 
-def _scan(work: Workspace, prefix: str, count: int, values: object, scanned: object, flags: bool) -> tuple[Launch, ...]:
+def scan_launches(
+    work: Workspace, prefix: str, count: int, values: object, scanned: object, flags: bool
+) -> tuple[Launch, ...]:
     """Exclusive scan of any length: segments, then the segment sums one level up, then both together."""
     levels = scan_levels(count)
     lengths, inputs, outputs = [count], [values], [scanned]
@@ -114,7 +116,7 @@ def block_maximum(work: Workspace) -> Step:
 def active_list(work: Workspace) -> Step:
     """Stream compaction of the blocks whose maximum is not zero; the list's length is read back once."""
     blocks, slots = _block_count(work), work.buffers["block_slots"]
-    scan = _scan(work, "block_scan", blocks, work.block_maximum, slots, flags=True)
+    scan = scan_launches(work, "block_scan", blocks, work.block_maximum, slots, flags=True)
     length = work.buffers["active_count"]
     compact = work.cover(
         blocks, np.int32(blocks), work.block_maximum, slots, work.active_blocks, length,
