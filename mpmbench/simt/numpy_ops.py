@@ -141,11 +141,39 @@ def _bits(kind: str) -> int:
 
 
 def _add(m: Modifiers) -> LaneOp:
-    return _add_or_sub(m, negate=False)
+    return _with_carry(m, takes=False) if "cc" in m.rest else _add_or_sub(m, negate=False)
 
 
 def _sub(m: Modifiers) -> LaneOp:
-    return _add_or_sub(m, negate=True)
+    return _with_carry(m, takes=False) if "cc" in m.rest else _add_or_sub(m, negate=True)
+
+
+def _with_carry(m: Modifiers, takes: bool) -> LaneOp:
+    """``add.cc``, ``addc``, ``subc``, ``madc.lo`` ...: sums of unbounded integers, cut to the width. The carry flag is
+    the carry of a sum and the borrow of a difference."""
+    root = m.item.root[:3]
+    kind = m.type("u32", "s32", "u64", "s64")
+    part = m.choice(("lo", "hi")) if root == "mad" else ""
+    gives = m.flag("cc")
+    bits = _bits(kind)
+    unsigned = f"u{bits}"
+    count = 3 if root == "mad" else 2
+
+    def apply(*sources: Array) -> Array | tuple[Array, ...]:
+        carry = sources[count].tolist() if takes else [False] * len(sources[0])
+        first, addend = sources[0], sources[count - 1]
+        if root == "mad":
+            high, low = _full_product(sources[0].view(DTYPES[kind]), sources[1].view(DTYPES[kind]))
+            first = (high if part == "hi" else low).view(DTYPES[unsigned])
+        if root == "sub":
+            exact = [x - y - c for x, y, c in zip(first.tolist(), addend.tolist(), carry, strict=True)]
+        else:
+            exact = [x + y + c for x, y, c in zip(first.tolist(), addend.tolist(), carry, strict=True)]
+        value = np.array([x % (1 << bits) for x in exact], dtype=DTYPES[unsigned])
+        return (value, np.array([not 0 <= x < 1 << bits for x in exact])) if gives else value
+
+    sources = (unsigned,) * count + (("pred",) if takes else ())
+    return LaneOp(sources, (unsigned, "pred") if gives else (unsigned,), apply)
 
 
 def _add_or_sub(m: Modifiers, negate: bool) -> LaneOp:
@@ -200,6 +228,8 @@ def _mul(m: Modifiers) -> LaneOp:
 
 
 def _mad(m: Modifiers) -> LaneOp:
+    if "cc" in m.rest:
+        return _with_carry(m, takes=False)
     kind = m.type("u16", "s16", "u32", "s32", "u64", "s64", "f32", "f64")
     if kind[0] == "f":  # since sm_20 another spelling of fma
         m.rest.append(kind)
@@ -834,6 +864,7 @@ def _integer_to_integer(target: str, sat: bool) -> Callable[[Array], Array]:
 _BUILDERS: dict[str, Callable[[Modifiers], LaneOp]] = {
     "abs": _abs,
     "add": _add,
+    "addc": lambda m: _with_carry(m, takes=True),
     "and": _logic(np.bitwise_and, np.logical_and),
     "bfe": _bfe,
     "bfi": _bfi,
@@ -854,6 +885,7 @@ _BUILDERS: dict[str, Callable[[Modifiers], LaneOp]] = {
     "lg2": _approximation(np.log2),
     "lop3": _lop3,
     "mad": _mad,
+    "madc": lambda m: _with_carry(m, takes=True),
     "mad24": _mad24,
     "max": lambda m: _min_or_max(m, is_min=False),
     "min": lambda m: _min_or_max(m, is_min=True),
@@ -879,6 +911,7 @@ _BUILDERS: dict[str, Callable[[Modifiers], LaneOp]] = {
     "slct": _slct,
     "sqrt": _sqrt,
     "sub": _sub,
+    "subc": lambda m: _with_carry(m, takes=True),
     "szext": _szext,
     "tanh": _approximation(np.tanh),
     "testp": _testp,

@@ -79,6 +79,8 @@ class NotReg:
 
 Operand = Reg | Imm | Special | Symbol | Address | Vector | NotReg
 
+CARRY = Reg("%carry", "pred")
+
 
 @dataclass(frozen=True, slots=True)
 class Instruction:
@@ -86,7 +88,8 @@ class Instruction:
 
     opcode: the text as printed, ``ld.global.v4.f32``; ``root`` and ``modifiers`` are its parts.
     dsts: what it writes: registers (None for ``_``) in order; ``setp p|q`` and ``shfl d|p`` have two, a vector load
-    has one per element. srcs: the other operands in order.
+    has one per element. srcs: the other operands in order. The carry flag of ``add.cc``, ``addc`` and the like is an
+    ordinary predicate register, CARRY: last of dsts where it is written, last of srcs where it is read.
     guard/negated: ``@p`` / ``@!p``.  targets: labels of branches.
     """
 
@@ -475,11 +478,17 @@ class _Parser:
             return replace(found, offset=found.offset + int(offset)) if offset else found
 
         dsts: tuple[Reg | None, ...] = ()
-        if root not in _NO_DESTINATION and parts:
+        modifiers = opcode.split(".")[1:]
+        if (root not in _NO_DESTINATION or (root in {"bar", "barrier"} and "red" in modifiers)) and parts:
             head, parts = parts[0], parts[1:]
             names = _split_commas(head[1:-1]) if head.startswith("{") else head.split("|")
             dsts = tuple(None if name == "_" else register(name) for name in names)
-        return Instruction(opcode, dsts, tuple(map(operand, parts)), guard, negated, (), line)
+        srcs = tuple(map(operand, parts))
+        if root in {"addc", "subc", "madc"}:
+            srcs = (*srcs, CARRY)
+        if "cc" in modifiers:
+            dsts = (*dsts, CARRY)
+        return Instruction(opcode, dsts, srcs, guard, negated, (), line)
 
     def _address(self, function: _Function, text: str, register) -> Address:
         base, offset = text.strip(), 0
@@ -550,6 +559,7 @@ class _Inliner:
         self.out: list[Instruction] = []
         self.labels: dict[str, int] = {}
         self.calls = 0
+        self.argument_bits: dict[str, int] = {}  # width of what was last stored to an argument's pseudo-register
         self.call_line: SourceLine | None = None  # stands in for the lines of library functions, which have none
         self.shared_bytes, self.local_bytes = root.shared_bytes, root.local_bytes
         self.shared_of: dict[str, int] = {root.name: 0}  # a function's own static shared variables exist once
@@ -642,7 +652,10 @@ class _Inliner:
         return not is_kernel_parameter
 
     def _argument_move(self, item: Instruction, rename, tag: str, params: dict[str, str], guard: Reg | None) -> None:
-        """``st.param [arg+8], %r`` / ``ld.param %r, [arg+8]`` -> moves to and from the pseudo-register ``arg+8``."""
+        """``st.param [arg+8], %r`` / ``ld.param %r, [arg+8]`` -> moves to and from the pseudo-register ``arg+8``.
+
+        It is as wide as what was last stored; a narrower read (a bool passed as 32 bits) takes its low bits.
+        """
         address = next(s for s in item.srcs if isinstance(s, Address))
         assert isinstance(address.base, Symbol)
         kind = item.modifiers[-1]
@@ -653,11 +666,19 @@ class _Inliner:
         if len(values) == 1 and isinstance(values[0], Vector):
             values = values[0].items
         for position, value in enumerate(values):
-            slot = Reg(f"{variable}+{address.offset + position * width}", f"b{bits}")
+            name = f"{variable}+{address.offset + position * width}"
             if value is None:
                 continue
-            dst, src = (rename(value), slot) if item.root == "ld" else (slot, rename(value))
-            self.out.append(Instruction(f"mov.b{bits}", (dst,), (src,), guard, item.negated, (), item.line))
+            if item.root == "st":
+                self.argument_bits[name] = bits
+                opcode, dst, src = f"mov.b{bits}", Reg(name, f"b{bits}"), rename(value)
+            else:
+                have = self.argument_bits.get(name, bits)
+                opcode, dst, src = f"mov.b{bits}", rename(value), Reg(name, f"b{have}")
+                if 8 * width < have:
+                    sign = "s" if kind[0] == "s" else "u"
+                    opcode = f"cvt.{sign}{_BYTES[dst.type] * 8}.{sign}{8 * width}"
+            self.out.append(Instruction(opcode, (dst,), (src,), guard, item.negated, (), item.line))
 
     def _call(self, item, guard, tag, line, chain, params) -> None:
         name = item.targets[0]
