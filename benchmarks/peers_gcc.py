@@ -1,0 +1,63 @@
+"""g++ -O3 -march=native of the plain loop in transfer.cpp: what a compiled language gives without any tricks."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from scenes import PeerMissing, Scene
+
+NAME = "g++"
+FLAGS = ("-O3", "-march=native")
+SOURCE = Path(__file__).with_name("transfer.cpp")
+
+
+class _Domain(ctypes.Structure):
+    _fields_ = (
+        ("nx", ctypes.c_int), ("ny", ctypes.c_int),
+        ("ox", ctypes.c_float), ("oy", ctypes.c_float), ("oz", ctypes.c_float), ("inv_dx", ctypes.c_float),
+    )  # fmt: skip
+
+
+class Peer:
+    """Compiles once; PeerMissing where there is no g++ or it fails."""
+
+    name = NAME
+
+    def __init__(self) -> None:
+        compiler = shutil.which("g++")
+        if compiler is None:
+            raise PeerMissing("no g++ on PATH")
+        version = subprocess.run([compiler, "-dumpfullversion"], capture_output=True, text=True)
+        self.version = f"{version.stdout.strip()} {' '.join(FLAGS)}"
+        with tempfile.TemporaryDirectory(prefix="mpmbench-") as folder:
+            library = Path(folder) / "transfer.so"
+            build = subprocess.run(
+                [compiler, *FLAGS, "-shared", "-fPIC", "-o", str(library), str(SOURCE)], capture_output=True, text=True
+            )
+            if build.returncode:
+                message = (build.stderr.strip().splitlines() or ["no message"])[0]
+                raise PeerMissing(f"g++ refused transfer.cpp: {message}")
+            # The loader keeps the mapping, so the file may go.
+            self._library = ctypes.CDLL(str(library))
+
+    def _launcher(self, function: str, scene: Scene, arrays: tuple[np.ndarray, ...]):
+        grid = scene.grid
+        domain = _Domain(grid.shape[0], grid.shape[1], *grid.origin, 1 / grid.dx)
+        pointers = [ctypes.c_void_p(array.ctypes.data) for array in arrays]
+        call = getattr(self._library, function)
+        call.restype = None
+        count = ctypes.c_int(scene.count)
+        return lambda: call(domain, count, *pointers)
+
+    def p2g(self, scene: Scene, nodes: np.ndarray):
+        """A call that adds all particles into ``nodes`` (nodes, 4)."""
+        return self._launcher("p2g", scene, (scene.attributes, nodes))
+
+    def g2p(self, scene: Scene, nodes: np.ndarray, results: np.ndarray):
+        """A call that gathers ``nodes`` (nodes, 4) into ``results`` (n, 4)."""
+        return self._launcher("g2p", scene, (scene.attributes, nodes, results))
