@@ -9,7 +9,8 @@ operation:
    own rounded dx.
 2. Where f vanishes together with its gradient, at the support's edge, what remains is the second order,
    (eps max|xi|)**2 |q| |f''| / 2 with |f''| <= 7: the third sum, ``C3`` = 4. It counts one node beyond the support, so
-   that a particle within rounding of a cell face may be put on either side of it.
+   that a particle within rounding of a cell face may be put on either side of it; only the linear spline, with its
+   jumping gradient, wants the cell that ``Dataset.node_units`` gives.
 3. A term has a handful of roundings besides: 3 to 5 in each of three 1-D weights, 3 products, an APIC velocity of 6
    operations; each u of |f q| or little more, of either sign: ``C1`` = 8, or 16 roundings all of one sign. NumPy
    emulations of the textbook formulas need up to 6 without any help of 1 and 2, adding up included.
