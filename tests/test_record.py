@@ -48,7 +48,7 @@ def simulated(environment: Environment) -> Record:
         variant="p2g_global_atomic",
         transfer="p2g",
         dataset=DatasetSummary(
-            "röhre \"odd\"\n", {"kind": "random", "box": [1, 2]}, 3, 1000, Grid((8, 9, 10), 0.1), "f" * 64, {"mean": 4.0}
+            'röhre "odd"\n', {"kind": "random", "box": [1, 2]}, 3, 1000, Grid((8, 9, 10), 0.1), "f" * 64, {"mean": 4.0}
         ),
         axes={"spline": "cubic", "block_shape": (8, 4, 4), "batching": 4},
         default_axes={"spline": "cubic", "block_shape": (8, 4, 4), "batching": 1},

@@ -68,8 +68,11 @@ class Document:
     left_out: tuple[str, ...] = field(default=())
 
 
-def build(records: Sequence[Record], detail: int = 3) -> Document:
-    """detail: 3 everything, 2 without hottest lines, 1 without steps either, 0 without charts either."""
+def build(records: Sequence[Record], detail: int = 3, most_rows: int | None = None) -> Document:
+    """detail: 3 everything, 2 without hottest lines, 1 without steps either, 0 without charts either.
+
+    most_rows: of a table, the best ones; every row where None.
+    """
     if not records:
         raise InputError("no records to report: run something first")
     records = list(records)
@@ -88,6 +91,8 @@ def build(records: Sequence[Record], detail: int = 3) -> Document:
     ):
         if found:
             sections.append(Section(title, (_untitled(found),)))
+    if most_rows is not None:
+        sections = [replace(s, tables=tuple(_shortened(t, most_rows) for t in s.tables)) for s in sections]
     left_out = ("hottest lines", "single steps", "charts")[: 3 - detail]
     verdict, agreed = _verdict(records)
     return Document(
@@ -103,6 +108,14 @@ def build(records: Sequence[Record], detail: int = 3) -> Document:
     )
 
 
+def _shortened(table: Table, most_rows: int) -> Table:
+    more = len(table.rows) - most_rows
+    if more <= 0:
+        return table
+    note = f"{more} more rows are left out; the records hold them."
+    return replace(table, rows=table.rows[:most_rows], notes=(*table.notes, note))
+
+
 def _untitled(table: Table) -> Table:
     return replace(table, title="")
 
@@ -116,7 +129,7 @@ def _verdict(records: Sequence[Record]) -> tuple[str, bool]:
     strategies = _names(ran)
     sets = _plural(len({r.dataset.fingerprint for r in ran}), "dataset")
     if not ran:
-        return f"Nothing ran: all {_plural(len(records), 'run')} were skipped.", False
+        return f"Nothing ran: {_plural(len(records), 'run')} skipped.", False
     if not wrong:
         worst = max(r.check.ratio for r in ran if r.check)
         every = "All" if len(strategies) > 1 else "The"
@@ -190,10 +203,10 @@ def _attention(records: Sequence[Record], groups: Sequence[Group]) -> list[Atten
         where = f"{tables.label(r)} on {tables.dataset_name(r.dataset)}"
         if r.status == "wrong":
             action = f"Do not use it; `mpmbench check -b {r.variant}` shows where it first differs."
-            note("wrong", f"{r.variant} gives WRONG RESULTS", action, f"{where}, {tables.reason(r)}")
+            note("wrong", f"Wrong result of {r.variant}", action, f"{where}, {tables.error_text(r)}")
         elif r.status == "findings":
             action = "Its result cannot be relied on; the findings below name the lines."
-            note("wrong", f"{r.variant} was {tables.reason(r)}", action, where)
+            note("wrong", f"Refused, {tables.finding_text(r)}", action, where)
         elif r.status == "broken":
             note("wrong", tables.reason(r), "It has no result and no rank.", where)
         elif r.status == "unchecked":
@@ -320,7 +333,12 @@ def _break_even_lines(g: Group) -> list[Bars | Lines]:
 
 def _legend(sections: Sequence[Section]) -> tuple[tuple[str, str, str], ...]:
     shown = [t for s in sections for t in (*s.tables, *(t for d in s.details for t in d.tables))]
-    columns = {(c.title, str(c.kind), c.explain): None for t in shown for c in t.columns if c.explain}
+    columns = {
+        (c.title, "" if c.kind is Kind.NAME else str(c.kind), c.explain): None
+        for t in shown
+        for c in t.columns
+        if c.explain
+    }
     return tuple(columns)
 
 

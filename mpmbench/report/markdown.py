@@ -18,11 +18,13 @@ def render(document: Document) -> str:
     parts += ["\n".join(f"- {escape(sentence)}" for sentence in document.answer)]
     if document.attention:
         parts.append("## Attention")
-        parts.append("\n".join(f"- {_LEVELS[a.level]} {escape(a.text)} {escape(a.action)}" for a in document.attention))
+        parts.append(
+            "\n".join(f"- {_LEVELS[a.level]} {escape(a.text)} {_with_code(a.action)}" for a in document.attention)
+        )
     parts += [part for section in document.sections for part in _section(section)]
     parts.append("## How to read the tables")
     parts.append("\n".join(f"- *{kind}*: {text}" for kind, text in KINDS.items()))
-    parts.append("\n".join(f"- {escape(title)} ({kind}): {escape(text)}" for title, kind, text in document.legend))
+    parts.append("\n".join(_meaning(*entry) for entry in document.legend))
     parts.append("## Environment")
     parts.append("\n".join(f"- {escape(name)}: {escape(value)}" for name, value in document.environment))
     if document.left_out:
@@ -74,6 +76,20 @@ def _code(text: str) -> str:
     fence = "`" * (1 + max((len(run) for run in re.findall("`+", text)), default=0))
     pad = " " if "`" in text else ""
     return f"{fence}{pad}{text}{pad}{fence}"
+
+
+def _with_code(text: str) -> str:
+    """Text whose back-ticked words are code."""
+    pieces = text.split("`")
+    return "".join(_code(piece) if i % 2 else _kept_spaces(piece) for i, piece in enumerate(pieces))
+
+
+def _kept_spaces(text: str) -> str:
+    return re.sub(r"\S.*\S|\S", lambda match: escape(match[0]), text)
+
+
+def _meaning(title: str, kind: str, text: str) -> str:
+    return f"- {escape(title)}{f' ({kind})' if kind else ''}: {escape(text)}"
 
 
 def escape(text: str) -> str:

@@ -7,9 +7,11 @@ one. Ranks, shares and ratios are of the kind of the numbers they come from.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
 from typing import Any
 
 from mpmbench.record import PER_TRANSFER_STEPS, DatasetSummary, Record, StepCost, total_cost
@@ -172,18 +174,18 @@ class Group:
     def simulated(self) -> bool:
         return self.first.simulated
 
-    @property
+    @cached_property
     def ranked(self) -> tuple[Record, ...]:
         return tuple(r for r in self.records if r.status == "ok" and _has_cost(r))
 
-    @property
+    @cached_property
     def baseline(self) -> Record | None:
         """The plainest run of unsorted global atomics (or gathers): fewest axes away from their defaults."""
         name = BASELINES.get(self.first.transfer)
         found = [r for r in self.ranked if r.variant == name and r.axes.get("particle_order") == "given"]
         return min(found, key=lambda r: len(changed_axes(r)), default=None)
 
-    @property
+    @cached_property
     def shared(self) -> dict[str, Any]:
         """Changed axes that all its runs share."""
         return shared_axes(self.records)
@@ -283,15 +285,25 @@ def reason(record: Record) -> str:
         case "broken":
             return f"failed: {record.failed_because}"
         case "wrong":
-            assert record.check is not None
-            node = "" if record.check.worst_node is None else f" at {axis_text(record.check.worst_node)}"
-            return f"WRONG RESULT: error {record.check.ratio:.3g} times the allowance{node}"
+            return f"WRONG RESULT: {error_text(record)}"
         case "findings":
-            kinds = sorted({finding.kind for finding in record.findings})
-            return f"refused: the engine found {', '.join(kinds)}"
+            return f"refused: {finding_text(record)}"
         case "unchecked":
             return "not checked, hence not ranked"
     return ""
+
+
+def error_text(record: Record) -> str:
+    """How far off a wrong run is, and where."""
+    check = record.check
+    if check is None:
+        return "no result"
+    where = "" if check.worst_node is None else f" at {axis_text(check.worst_node)}"
+    return f"error {check.ratio:.3g} times the allowance{where}"
+
+
+def finding_text(record: Record) -> str:
+    return f"the engine found {', '.join(sorted({finding.kind for finding in record.findings}))}"
 
 
 def _tally(record: Record) -> Tally | None:
@@ -421,16 +433,18 @@ _REQUESTS = _counted(
     _per(lambda t: t.gld_req + t.gst_req + t.gatom_req, particles),
     "global memory instructions per warp: loads, stores and atomics",
 )
-_SECTORS = _counted("sectors / particle", _per(sectors, particles), "32-byte sectors of those requests")
+_SECTORS = _counted(
+    "sectors / particle", _per(sectors, particles), "distinct 32-byte sectors per global memory request, summed"
+)
 _BYTES = _counted(
     "bytes / particle",
     _per(lambda t: t.sectors * SECTOR_BYTES, particles),
-    "sectors times 32: traffic between the SMs and L2",
+    "sectors times 32: traffic between SM and L2",
 )
 _FLOOR = _counted(
     "bytes / floor",
     lambda r: None if _tally(r) is None or not r.floor_bytes else _tally(r).sectors * SECTOR_BYTES / r.floor_bytes,  # type: ignore[union-attr]
-    "those bytes over the compulsory ones: each particle and each touched node once",
+    "bytes over the compulsory ones, each particle and each touched node once",
     Quantity.FACTOR,
 )
 _WAVEFRONTS = _counted(
@@ -475,10 +489,11 @@ _LOCAL = _counted(
 def _rank(records: Sequence[Record], counter: Callable[[Tally], int]) -> Callable[[Record], int | None]:
     """1 is the least; equal counts share a rank."""
     counts = {id(r): counter(t) for r in records if (t := _tally(r)) is not None}
+    ordered = sorted(counts.values())
 
     def value(record: Record) -> int | None:
         mine = counts.get(id(record))
-        return None if mine is None else 1 + sum(count < mine for count in counts.values())
+        return None if mine is None else 1 + bisect_left(ordered, mine)
 
     return value
 
@@ -510,13 +525,13 @@ def ranking(g: Group) -> Table:
         _counted(
             "break-even, sectors",
             _break_even(count_of(sectors), base),
-            "transfers per sort after which preprocessing has paid for itself in sectors",
+            "transfers per sort from which preprocessing has paid for itself",
             Quantity.TRANSFERS,
         ),
         _counted(
             "break-even, warp inst",
             _break_even(count_of(warp_inst), base),
-            "the same in warp instructions",
+            "transfers per sort from which preprocessing has paid for itself",
             Quantity.TRANSFERS,
         ),
         _MEMORY,
@@ -563,7 +578,7 @@ def preprocessing(g: Group) -> Table:
             _Source(
                 Column(
                     f"break-even, {name}", kind, Quantity.TRANSFERS, "less",
-                    "transfers per sort after which it beats the baseline in total",
+                    "transfers per sort from which preprocessing has paid for itself",
                 ),
                 _break_even(measure, base),
             )
@@ -670,7 +685,7 @@ def measured(g: Group) -> Table:
               Quantity.FACTOR, "more", "baseline's time over this one's, transfer alone"),
         timed("preprocessing", before, Quantity.SECONDS, None, "median times of its steps, added up"),
         timed("break-even", _break_even(seconds, base), Quantity.TRANSFERS, "less",
-              "transfers per sort after which preprocessing has paid for itself"),
+              "transfers per sort from which preprocessing has paid for itself"),
         _MEMORY,
     ]  # fmt: skip
     title = f"Ranking by measured time. {g.title}"
