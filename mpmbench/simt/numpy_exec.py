@@ -346,9 +346,11 @@ def _bits(lanes: Array) -> int:
 
 
 def _must_wait(warp: _Warp, step: _Step, mask: Array, active: Array) -> bool:
-    """Whether lanes that the operation names are alive but not here yet."""
+    """Whether lanes that the operation names are alive but not here yet. ``bar.sync`` is defined only for whole
+    warps, so it does not wait: it is a finding. ``barrier.sync`` without ``.aligned`` collects the lanes."""
     if step.kind == "barrier":
-        return bool((mask != warp.live).any())
+        aligned = step.item.root == "bar" or "aligned" in step.item.modifiers
+        return not aligned and bool((mask != warp.live).any())
     named = 0
     for members in np.unique(_members(warp, step, active)[active]):
         named |= int(members)
