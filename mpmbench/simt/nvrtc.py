@@ -61,7 +61,7 @@ class _Library:
         facts = path.stat()
         self.identity = f"{path.name} {facts.st_size} {facts.st_mtime_ns}"
 
-    @functools.cache  # noqa: B019: one library lives as long as the process
+    @functools.cache  # noqa: B019
     def handle(self) -> ctypes.CDLL:
         try:
             return ctypes.CDLL(str(self.path))
@@ -71,9 +71,7 @@ class _Library:
     def compile(self, text: str, name: str, options: Sequence[str]) -> str:
         nvrtc = self.handle()
         program = ctypes.c_void_p()
-        created = nvrtc.nvrtcCreateProgram(
-            ctypes.byref(program), text.encode(), name.encode(), 0, None, None
-        )
+        created = nvrtc.nvrtcCreateProgram(ctypes.byref(program), text.encode(), name.encode(), 0, None, None)
         if created != 0:
             raise InputError(f"{name}: NVRTC cannot start (error {created})")
         try:
@@ -116,4 +114,6 @@ def _library() -> _Library:
             for path in sorted(Path(folder).glob("lib/libnvrtc.so.*")):
                 if "alt" not in path.name and "builtins" not in path.name:
                     return _Library(path)
-    raise InputError("no CUDA compiler found: install nvidia-cuda-nvrtc-cu12 (pip install 'nvidia-cuda-nvrtc-cu12==12.9.*')")
+    raise InputError(
+        "no CUDA compiler found: install nvidia-cuda-nvrtc-cu12 (pip install 'nvidia-cuda-nvrtc-cu12==12.9.*')"
+    )

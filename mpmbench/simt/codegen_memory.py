@@ -1,0 +1,660 @@
+"""Loads, stores and atomics of one chunk of lanes.
+
+Lanes that must not touch memory are redirected to a *sink* area, so that wide accesses need no branch per lane.
+Atomics without a used result are put off to the next access that could see them and then carried out lane after lane:
+adds to neighbouring words become one wide add. That is one of the orders the memory model allows, always the same.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from mpmbench.simt.codegen_arith import ELEMENT, Refused, flush, is_float, is_signed
+from mpmbench.simt.codegen_ir import ELEMENT_BYTES, WARP, integer_of
+from mpmbench.simt.ptx import Address, Imm, Instruction, Operand, Reg, Symbol, Vector
+
+if TYPE_CHECKING:
+    from mpmbench.simt.codegen import SegmentBody
+
+SINK_REACH = 1 << 15  # bytes around the middle of the sink that an access may be displaced by
+SINK_BYTES = 2 * SINK_REACH + 64
+
+# Say how to cache or order, not what to do: lanes of one launch run in one fixed order here.
+_HINTS = re.compile(
+    r"(volatile|relaxed|acquire|release|acq_rel|weak|gpu|sys|cta|cluster|nc|ca|cg|cs|lu|cv|wb|wt|mmio|unified"
+    r"|L1::\w+|L2::\w+)$"
+)
+_SPACES = frozenset({"global", "shared", "local", "const", "param"})
+
+
+@dataclass(frozen=True)
+class Access:
+    """What a memory instruction does, from its modifiers. space is ``generic`` where none is named."""
+
+    space: str
+    operation: str  # of atomics: add, cas, ...
+    kind: str  # type of one element
+    count: int  # elements: 1, 2 or 4
+
+    @property
+    def width(self) -> int:
+        """Bytes per lane."""
+        return ELEMENT_BYTES[ELEMENT[self.kind]] * self.count
+
+
+def access_of(item: Instruction) -> Access:
+    space, operation, count = "generic", item.root, 1
+    *flags, kind = item.modifiers
+    if kind not in ELEMENT:
+        raise Refused
+    for flag in flags:
+        if flag in _SPACES or flag == "shared::cta":
+            space = flag.removesuffix("::cta")
+        elif flag in ("v2", "v4"):
+            count = int(flag[1])
+        elif item.root in ("atom", "red") and flag in _ATOMIC:
+            operation = flag
+        elif not _HINTS.match(flag):
+            raise Refused
+    return Access(space, operation, kind, count)
+
+
+_ATOMIC = frozenset({"add", "min", "max", "inc", "dec", "and", "or", "xor", "exch", "cas"})
+
+
+@dataclass(frozen=True)
+class Site:
+    """A memory instruction that is counted or checked. kind: load, store or atomic."""
+
+    index: int  # instruction in the kernel
+    kind: str
+    space: str
+    width: int  # bytes per lane
+    element: int  # bytes of one element
+
+
+@dataclass
+class Place:
+    """Where the lanes of one access point: ``base`` plus a 64-bit vector plus ``displacement`` bytes."""
+
+    base: str  # scalar pointer; "null" for absolute addresses
+    vector: str
+    displacement: int
+
+
+@dataclass
+class Deferred:
+    """An atomic add that has been put off."""
+
+    index: int
+    access: Access
+    key: object  # equal for addresses that differ by a constant and have the same active lanes
+    offset: int  # that constant
+    value: str
+    buffer: str  # of addresses
+    displacement: int
+    base: str
+    mask: str  # bits of the chunk's active lanes, i32
+
+
+def emit_access(ctx: SegmentBody, index: int, item: Instruction) -> None:
+    access = access_of(item)
+    address = next(operand for operand in item.srcs if isinstance(operand, Address))
+    if access.space == "param":
+        _load_parameter(ctx, item, access, address)
+        return
+    if access.space == "const":
+        if item.root != "ld":
+            raise Refused
+        _load(ctx, index, item, access, address)
+        return
+    if item.root in ("atom", "red"):
+        values = [operand for operand in item.srcs if not isinstance(operand, Address)]
+        used = bool(item.dsts) and item.dsts[0] is not None and item.dsts[0] in ctx.live_after(index)
+        if access.operation == "add" and not used and access.count == 1:
+            _defer_add(ctx, index, access, address, values[0])
+        else:
+            flush_deferred(ctx)
+            _atomic(ctx, index, item, access, address, values, used)
+        return
+    if not (item.root == "ld" and ("nc" in item.modifiers or access.space == "local")):
+        flush_deferred(ctx)
+    if item.root == "ld":
+        _load(ctx, index, item, access, address)
+    else:
+        _store(ctx, index, item, access, address)
+
+
+# --- addresses ----------------------------------------------------------------------------------------------------
+
+
+def _place(ctx: SegmentBody, index: int, space: str, address: Address) -> Place:
+    w = ctx.w
+    base = ctx.shared_pointer() if space == "shared" else "null"
+    match address.base:
+        case Reg(_, kind):
+            vector = ctx.read(address.base, "u64" if kind == "b64" else "u32")
+            if kind != "b64":
+                vector = w.cast("zext", vector, "i32", "i64")
+            return Place(base, vector, address.offset)
+        case Symbol(_, "shared", offset) if space == "shared":
+            return Place(base, "zeroinitializer", offset + address.offset)
+        case Symbol():
+            return Place(base, ctx.read(address.base, "u64"), address.offset)
+        case Imm(value):
+            return Place(base, "zeroinitializer", value + address.offset)
+    raise Refused
+
+
+def _address_buffer(ctx: SegmentBody, index: int, space: str, address: Address) -> tuple[str, int, str, object, int]:
+    """Addresses in memory, where scalar code finds them: -> buffer, displacement, base pointer, key, constant.
+
+    Dead lanes' addresses are those of the sink. One buffer serves all accesses whose addresses differ by constants.
+    """
+    form = ctx.forms[index]
+    mask_name, mask = ctx.active()
+    in_shared = space == "shared"
+    key = (form.terms, in_shared, mask_name)
+    known = ctx.anchors.get(key)
+    if known is not None and abs(form.constant - known[1]) < SINK_REACH - 64:
+        buffer, anchored, base = known
+        return buffer, form.constant - anchored, base, key, form.constant
+    w = ctx.w
+    place = _place(ctx, index, space, address)
+    vector = place.vector
+    if place.displacement and abs(place.displacement) >= SINK_REACH - 64:
+        vector = w.binary("add", "i64", vector, w.splat_int("i64", place.displacement))
+        place = Place(place.base, vector, 0)
+    sink = w.splat("i64", ctx.sink(in_shared))
+    safe = w.select("i64", mask, vector, sink)
+    buffer = ctx.lane_buffer("i64")
+    ctx.store_chunk(buffer, "i64", safe)
+    ctx.anchors[key] = (buffer, form.constant - place.displacement, place.base)
+    return buffer, place.displacement, place.base, key, form.constant
+
+
+def _lane_address(ctx: SegmentBody, buffer: str, lane: int | str, base: str, displacement: int) -> str:
+    """Scalar pointer of one lane of the chunk."""
+    w = ctx.w
+    at = w.at(buffer, 8 * lane) if isinstance(lane, int) else w.value(f"getelementptr i64, ptr {buffer}, i64 {lane}")
+    offset = w.load("i64", at, 8)
+    if displacement:
+        offset = w.value(f"add i64 {offset}, {displacement}")
+    if base == "null":
+        return w.value(f"inttoptr i64 {offset} to ptr")
+    return w.value(f"getelementptr i8, ptr {base}, i64 {offset}")
+
+
+def _pointers(ctx: SegmentBody, place: Place, extra: int = 0) -> str:
+    """Vector of pointers for gathers and scatters."""
+    w = ctx.w
+    vector = place.vector
+    displacement = place.displacement + extra
+    if displacement:
+        vector = w.binary("add", "i64", vector, w.splat_int("i64", displacement))
+    if place.base == "null":
+        return w.cast("inttoptr", vector, "i64", "ptr")
+    return w.value(f"getelementptr i8, ptr {place.base}, {w.vector('i64')} {vector}")
+
+
+def _account(ctx: SegmentBody, index: int, kind: str, access: Access, address: Address) -> None:
+    """Count the access, or check it: then only the lanes that pass go on."""
+    if not ctx.observes:
+        return
+    buffer, displacement, base, _, _ = _address_buffer(ctx, index, access.space, address)
+    element = ELEMENT_BYTES[ELEMENT[access.kind]]
+    site = Site(index, kind, access.space, access.width, element)
+    ctx.observe(site, buffer, displacement, base)
+
+
+# --- loads --------------------------------------------------------------------------------------------------------
+
+
+def _load(ctx: SegmentBody, index: int, item: Instruction, access: Access, address: Address) -> None:
+    if access.space != "const":
+        _account(ctx, index, "load", access, address)
+    element = ELEMENT[access.kind]
+    if access.count == 4 and access.width == 16:
+        values = _load_quads(ctx, index, access, address, element)
+    elif access.width in (1, 2):
+        values = [_load_small(ctx, index, access, address, element)]
+    elif access.width in (4, 8):
+        whole = _gather(ctx, _place(ctx, index, access.space, address), f"i{8 * access.width}", access.width)
+        values = _split(ctx, whole, 8 * access.width, access.count, element)
+    elif access.count == 2 and access.width == 16:
+        place = _place(ctx, index, access.space, address)
+        values = [_gather(ctx, place, element, 8, 8 * part) for part in range(2)]
+    else:
+        raise Refused
+    for position, value in enumerate(values):
+        dst = item.dsts[position]
+        if dst is not None:
+            _write_loaded(ctx, item, position, value, access.kind, dst)
+
+
+def _write_loaded(ctx: SegmentBody, item: Instruction, position: int, value: str, kind: str, dst: Reg) -> None:
+    """Loads into a wider register extend by the loaded type's sign."""
+    element = ELEMENT[kind]
+    register = ctx.element(dst)
+    wide = integer_of(register)
+    if ELEMENT_BYTES[element] < ELEMENT_BYTES[register]:
+        value = ctx.w.cast("sext" if is_signed(kind) else "zext", value, element, wide)
+        element = wide
+    ctx.write(item, position, value, element)
+
+
+def _gather(ctx: SegmentBody, place: Place, element: str, align: int, extra: int = 0) -> str:
+    w = ctx.w
+    _, mask = ctx.active()
+    pointers = _pointers(ctx, place, extra)
+    suffix = f"v{w.lanes}{ {'float': 'f32', 'double': 'f64'}.get(element, element) }.v{w.lanes}p0"
+    vector, masks = w.vector(element), w.vector("i1")
+    w.declare(f"declare {vector} @llvm.masked.gather.{suffix}({w.vector('ptr')}, {masks}, {vector})")
+    return w.value(
+        f"call {vector} @llvm.masked.gather.{suffix}({w.vector('ptr')} align {align} {pointers}, {masks} {mask}, "
+        f"{vector} zeroinitializer)"
+    )
+
+
+def _split(ctx: SegmentBody, whole: str, bits: int, count: int, element: str) -> list[str]:
+    """One integer per lane -> its ``count`` parts, lowest first."""
+    w = ctx.w
+    part_bits = bits // count
+    if count == 1:
+        return [w.reinterpret(whole, f"i{bits}", element)]
+    parts = []
+    for part in range(count):
+        value = w.binary("lshr", f"i{bits}", whole, w.splat_int(f"i{bits}", part * part_bits)) if part else whole
+        value = w.cast("trunc", value, f"i{bits}", f"i{part_bits}")
+        parts.append(w.reinterpret(value, f"i{part_bits}", element))
+    return parts
+
+
+def _load_quads(ctx: SegmentBody, index: int, access: Access, address: Address, element: str) -> list[str]:
+    """Four words per lane: 16-byte loads, transposed in registers."""
+    w, n = ctx.w, ctx.w.lanes
+    buffer, displacement, base, _, _ = _address_buffer(ctx, index, access.space, address)
+    rows = []
+    for tile_lane in range(4):
+        quads = []
+        for tile in range(n // 4):
+            pointer = _lane_address(ctx, ctx.chunk_of(buffer), 4 * tile + tile_lane, base, displacement)
+            quads.append(w.load(f"<4 x {element}>", pointer, 16))
+        rows.append(_concatenate(ctx, quads, element))
+    return w.transpose4(element, rows)
+
+
+def _concatenate(ctx: SegmentBody, parts: Sequence[str], element: str) -> str:
+    """Vectors of equal length, one after the other."""
+    w, size = ctx.w, 4
+    values = list(parts)
+    while len(values) > 1:
+        mask = ", ".join(f"i32 {i}" for i in range(2 * size))
+        kind = f"<{size} x {element}>"
+        values = [
+            w.value(f"shufflevector {kind} {a}, {kind} {b}, <{2 * size} x i32> <{mask}>")
+            for a, b in zip(values[::2], values[1::2], strict=True)
+        ]
+        size *= 2
+    return values[0]
+
+
+def _load_small(ctx: SegmentBody, index: int, access: Access, address: Address, element: str) -> str:
+    """One or two bytes per lane."""
+    w = ctx.w
+    if access.count != 1:
+        raise Refused
+    buffer, displacement, base, _, _ = _address_buffer(ctx, index, access.space, address)
+    result = w.buffer(8 * WARP)
+    size = ELEMENT_BYTES[element]
+
+    def body(lane: str) -> None:
+        pointer = _lane_address(ctx, ctx.chunk_of(buffer), lane, base, displacement)
+        value = w.load(element, pointer, size)
+        w.store(element, value, w.value(f"getelementptr {element}, ptr {result}, i64 {lane}"), size)
+
+    _for_each_lane(ctx, ctx.active_bits(), body)
+    return w.load(w.vector(element), result, min(64, size * w.lanes))
+
+
+def _load_parameter(ctx: SegmentBody, item: Instruction, access: Access, address: Address) -> None:
+    """Parameters are the same for all lanes, save where the address is computed."""
+    if item.root != "ld":
+        raise Refused
+    w, element = ctx.w, ELEMENT[access.kind]
+    size = ELEMENT_BYTES[element]
+    for position, dst in enumerate(item.dsts):
+        if dst is None:
+            continue
+        if isinstance(address.base, Symbol):
+            offset = address.base.offset + address.offset + position * size
+            scalar = w.load(element, w.at(ctx.params_pointer(), offset), size)
+            value = w.splat(element, scalar)
+        else:
+            if size < 4:
+                raise Refused
+            vector = ctx.read(address.base, "u64")
+            place = Place(ctx.params_pointer(), vector, address.offset)
+            value = _gather(ctx, place, element, size, position * size)
+        _write_loaded(ctx, item, position, value, access.kind, dst)
+
+
+# --- stores -------------------------------------------------------------------------------------------------------
+
+
+def _store(ctx: SegmentBody, index: int, item: Instruction, access: Access, address: Address) -> None:
+    source = item.srcs[1]
+    operands: Sequence[Operand | None] = source.items if isinstance(source, Vector) else [source]
+    element = ELEMENT[access.kind]
+    values = [ctx.read(operand, access.kind) for operand in operands if operand is not None]
+    _account(ctx, index, "store", access, address)
+    if access.count == 4 and access.width == 16:
+        _store_quads(ctx, index, access, address, element, values)
+    elif access.width in (1, 2):
+        _store_small(ctx, index, access, address, element, values[0])
+    elif access.width in (4, 8):
+        whole = _join(ctx, values, 8 * access.width, element)
+        _scatter(ctx, _place(ctx, index, access.space, address), f"i{8 * access.width}", access.width, whole)
+    elif access.count == 2 and access.width == 16:
+        place = _place(ctx, index, access.space, address)
+        for part, value in enumerate(values):
+            _scatter(ctx, place, element, 8, value, 8 * part)
+    else:
+        raise Refused
+
+
+def _scatter(ctx: SegmentBody, place: Place, element: str, align: int, value: str, extra: int = 0) -> None:
+    """Where lanes meet at one address, the highest one is the last to write."""
+    w = ctx.w
+    _, mask = ctx.active()
+    pointers = _pointers(ctx, place, extra)
+    suffix = f"v{w.lanes}{ {'float': 'f32', 'double': 'f64'}.get(element, element) }.v{w.lanes}p0"
+    vector, masks = w.vector(element), w.vector("i1")
+    w.declare(f"declare void @llvm.masked.scatter.{suffix}({vector}, {w.vector('ptr')}, {masks})")
+    w.emit(
+        f"call void @llvm.masked.scatter.{suffix}({vector} {value}, {w.vector('ptr')} align {align} {pointers}, "
+        f"{masks} {mask})"
+    )
+
+
+def _join(ctx: SegmentBody, values: Sequence[str], bits: int, element: str) -> str:
+    """Parts, lowest first -> one integer per lane."""
+    w = ctx.w
+    part = f"i{bits // len(values)}"
+    integers = [w.reinterpret(value, element, part) for value in values]
+    if len(values) == 1:
+        return integers[0]
+    whole = w.cast("zext", integers[0], part, f"i{bits}")
+    for position, value in enumerate(integers[1:], 1):
+        wide = w.cast("zext", value, part, f"i{bits}")
+        shifted = w.binary("shl", f"i{bits}", wide, w.splat_int(f"i{bits}", position * bits // len(values)))
+        whole = w.binary("or", f"i{bits}", whole, shifted)
+    return whole
+
+
+def _store_quads(
+    ctx: SegmentBody, index: int, access: Access, address: Address, element: str, values: Sequence[str]
+) -> None:
+    w, n = ctx.w, ctx.w.lanes
+    buffer, displacement, base, _, _ = _address_buffer(ctx, index, access.space, address)
+    columns = w.transpose4(element, values)
+    for lane in range(n):
+        tile, tile_lane = divmod(lane, 4)
+        mask = ", ".join(f"i32 {4 * tile + part}" for part in range(4))
+        vector = w.vector(element)
+        quad = w.value(f"shufflevector {vector} {columns[tile_lane]}, {vector} poison, <4 x i32> <{mask}>")
+        pointer = _lane_address(ctx, ctx.chunk_of(buffer), lane, base, displacement)
+        w.store(f"<4 x {element}>", quad, pointer, 16)
+
+
+def _store_small(ctx: SegmentBody, index: int, access: Access, address: Address, element: str, value: str) -> None:
+    w = ctx.w
+    if access.count != 1:
+        raise Refused
+    buffer, displacement, base, _, _ = _address_buffer(ctx, index, access.space, address)
+    size = ELEMENT_BYTES[element]
+    values = w.buffer(8 * WARP)
+    w.store(w.vector(element), value, values, min(64, size * w.lanes))
+
+    def body(lane: str) -> None:
+        pointer = _lane_address(ctx, ctx.chunk_of(buffer), lane, base, displacement)
+        scalar = w.load(element, w.value(f"getelementptr {element}, ptr {values}, i64 {lane}"), size)
+        w.store(element, scalar, pointer, size)
+
+    _for_each_lane(ctx, ctx.active_bits(), body)
+
+
+# --- atomics ------------------------------------------------------------------------------------------------------
+
+
+def _for_each_lane(ctx: SegmentBody, bits: str, body: Callable[[str], None]) -> None:
+    """Code for every set bit of an i32, lowest first. body gets the lane's number in the chunk as an i64."""
+    w = ctx.w
+    number = ctx.fresh_label()
+    before, loop, after = f"before{number}", f"lane{number}", f"after{number}"
+    w.emit(f"br label %{before}")
+    w.label(before)
+    empty = w.value(f"icmp eq i32 {bits}, 0")
+    w.emit(f"br i1 {empty}, label %{after}, label %{loop}")
+    w.label(loop)
+    left, rest = f"%left{number}", f"%rest{number}"
+    w.emit(f"{left} = phi i32 [ {bits}, %{before} ], [ {rest}, %{loop}.end ]")
+    w.declare("declare i32 @llvm.cttz.i32(i32, i1)")
+    position = w.value(f"call i32 @llvm.cttz.i32(i32 {left}, i1 true)")
+    body(w.value(f"zext nneg i32 {position} to i64"))
+    w.emit(f"br label %{loop}.end")
+    w.label(f"{loop}.end")
+    less = w.value(f"add i32 {left}, -1")
+    w.emit(f"{rest} = and i32 {left}, {less}")
+    done = w.value(f"icmp eq i32 {rest}, 0")
+    w.emit(f"br i1 {done}, label %{after}, label %{loop}")
+    w.label(after)
+
+
+def _atomic(
+    ctx: SegmentBody,
+    index: int,
+    item: Instruction,
+    access: Access,
+    address: Address,
+    operands: Sequence[Operand],
+    used: bool,
+) -> None:
+    """Lane after lane: read, combine, write; the old values are the result."""
+    if access.count != 1 or ELEMENT_BYTES[ELEMENT[access.kind]] < 4:
+        raise Refused
+    w, element = ctx.w, ELEMENT[access.kind]
+    size = ELEMENT_BYTES[element]
+    values = []
+    for operand in operands:
+        buffer = w.buffer(8 * WARP)
+        w.store(w.vector(element), ctx.read(operand, access.kind), buffer, min(64, size * w.lanes))
+        values.append(buffer)
+    _account(ctx, index, "atomic", access, address)
+    addresses, displacement, base, _, _ = _address_buffer(ctx, index, access.space, address)
+    result = w.buffer(8 * WARP)
+
+    def body(lane: str) -> None:
+        pointer = _lane_address(ctx, ctx.chunk_of(addresses), lane, base, displacement)
+        scalars = [w.load(element, w.value(f"getelementptr {element}, ptr {v}, i64 {lane}"), size) for v in values]
+        old = w.load(element, pointer, size)
+        w.store(element, _combine(ctx, access, element, old, scalars), pointer, size)
+        w.store(element, old, w.value(f"getelementptr {element}, ptr {result}, i64 {lane}"), size)
+
+    _for_each_lane(ctx, ctx.active_bits(), body)
+    if used:
+        ctx.write(item, 0, w.load(w.vector(element), result, min(64, size * w.lanes)), element)
+
+
+def _combine(ctx: SegmentBody, access: Access, element: str, old: str, values: Sequence[str]) -> str:
+    """New value at the address."""
+    w, operation = ctx.w, access.operation
+    if operation == "exch":
+        return values[0]
+    if operation == "cas":
+        integer = integer_of(element)
+        bits = [w.value(f"bitcast {element} {v} to {integer}") if integer != element else v for v in (old, values[0])]
+        same = w.value(f"icmp eq {integer} {bits[0]}, {bits[1]}")
+        return w.value(f"select i1 {same}, {element} {values[1]}, {element} {old}")
+    value = values[0]
+    if is_float(access.kind):
+        if operation == "add":
+            return _flushed_scalar(ctx, access, w.value(f"fadd {element} {old}, {value}"))
+        raise Refused
+    if operation in ("add", "and", "or", "xor"):
+        return w.value(f"{operation} {element} {old}, {value}")
+    if operation in ("min", "max"):
+        less = "slt" if is_signed(access.kind) else "ult"
+        below = w.value(f"icmp {less} {element} {old}, {value}")
+        low, high = (old, value) if operation == "min" else (value, old)
+        return w.value(f"select i1 {below}, {element} {low}, {element} {high}")
+    if operation == "inc":  # old >= limit ? 0 : old + 1
+        at_end = w.value(f"icmp uge {element} {old}, {value}")
+        more = w.value(f"add {element} {old}, 1")
+        return w.value(f"select i1 {at_end}, {element} 0, {element} {more}")
+    # dec: old == 0 or old > limit ? limit : old - 1
+    is_zero = w.value(f"icmp eq {element} {old}, 0")
+    is_above = w.value(f"icmp ugt {element} {old}, {value}")
+    wraps = w.value(f"or i1 {is_zero}, {is_above}")
+    less_one = w.value(f"sub {element} {old}, 1")
+    return w.value(f"select i1 {wraps}, {element} {value}, {element} {less_one}")
+
+
+def _flushed_scalar(ctx: SegmentBody, access: Access, value: str) -> str:
+    """``atom.add.f32`` on global memory flushes denormals; where the processor does not, code does."""
+    if access.kind != "f32" or access.space == "shared" or ctx.hardware_ftz or not ctx.explicit_ftz:
+        return value
+    w = ctx.w
+    lanes, w.lanes = w.lanes, 1
+    vector = w.value(f"insertelement <1 x float> poison, float {value}, i32 0")
+    flushed = flush(w, vector)
+    result = w.value(f"extractelement <1 x float> {flushed}, i32 0")
+    w.lanes = lanes
+    return result
+
+
+def _defer_add(ctx: SegmentBody, index: int, access: Access, address: Address, operand: Operand) -> None:
+    if ELEMENT_BYTES[ELEMENT[access.kind]] < 4:
+        raise Refused
+    value = ctx.read(operand, access.kind)
+    if ctx.checks:
+        flush_deferred(ctx)
+        _account(ctx, index, "atomic", access, address)
+    buffer, displacement, base, key, constant = _address_buffer(ctx, index, access.space, address)
+    entry = Deferred(index, access, (key, access.kind), constant, value, buffer, displacement, base, ctx.active_bits())
+    ctx.deferred.append(entry)
+
+
+def flush_deferred(ctx: SegmentBody) -> None:
+    """Carry out the adds that were put off, lane after lane, neighbouring words together."""
+    if not ctx.deferred:
+        return
+    entries, ctx.deferred = ctx.deferred, []
+    by_mask: dict[str, list[list[Deferred]]] = {}
+    for run in _runs(entries):
+        by_mask.setdefault(run[0].mask, []).append(run)
+        _count_run(ctx, run)
+    for mask, runs in by_mask.items():
+        _add_runs(ctx, mask, runs)
+
+
+def _count_run(ctx: SegmentBody, run: list[Deferred]) -> None:
+    if not ctx.counts:
+        return
+    first = run[0]
+    sites = [Site(entry.index, "atomic", entry.access.space, entry.access.width, entry.access.width) for entry in run]
+    ctx.observe_run(sites, first.buffer, first.displacement, first.base)
+
+
+def _runs(entries: list[Deferred]) -> list[list[Deferred]]:
+    """Split into runs of 4, 2 or 1 adds to consecutive words, in order of first appearance."""
+    groups: dict[object, dict[int, list[Deferred]]] = {}
+    for entry in entries:
+        groups.setdefault(entry.key, {}).setdefault(entry.offset, []).append(entry)
+    runs: list[list[Deferred]] = []
+    for group in groups.values():
+        size = next(iter(group.values()))[0].access.width
+        while group:
+            start = min(group)
+            length = 1
+            while length < 4 and start + length * size in group:
+                length += 1
+            length = 2 if length == 3 else length
+            run = []
+            for offset in range(start, start + length * size, size):
+                run.append(group[offset].pop(0))
+                if not group[offset]:
+                    del group[offset]
+            runs.append(run)
+    return sorted(runs, key=lambda run: min(entry.index for entry in run))
+
+
+def _add_runs(ctx: SegmentBody, mask: str, runs: list[list[Deferred]]) -> None:
+    w, n = ctx.w, ctx.w.lanes
+    staged = [(run, _stage(ctx, run)) for run in runs]
+
+    def body(lane: str) -> None:
+        # Element of the lane in transposed quads: row lane % 4, tile lane / 4.
+        row = w.value(f"and i64 {lane}, 3")
+        tile = w.value(f"lshr i64 {lane}, 2")
+        row_at = w.value(f"mul i64 {row}, {n}")
+        tile_at = w.value(f"shl i64 {tile}, 2")
+        quad_at = w.value(f"add i64 {row_at}, {tile_at}")
+        pair_at = w.value(f"shl i64 {lane}, 1")
+        offsets: dict[str, str] = {}
+        for run, values in staged:
+            first = run[0]
+            element = ELEMENT[first.access.kind]
+            length = len(run)
+            kind = element if length == 1 else f"<{length} x {element}>"
+            if first.buffer not in offsets:
+                at = w.value(f"getelementptr i64, ptr {ctx.chunk_of(first.buffer)}, i64 {lane}")
+                offsets[first.buffer] = w.load("i64", at, 8)
+            place = offsets[first.buffer]
+            if first.displacement:
+                place = w.value(f"add i64 {place}, {first.displacement}")
+            if first.base == "null":
+                pointer = w.value(f"inttoptr i64 {place} to ptr")
+            else:
+                pointer = w.value(f"getelementptr i8, ptr {first.base}, i64 {place}")
+            at = {1: lane, 2: pair_at, 4: quad_at}[length]
+            size = ELEMENT_BYTES[element]
+            value = w.load(kind, w.value(f"getelementptr {element}, ptr {values}, i64 {at}"), size * length)
+            old = w.load(kind, pointer, size)
+            if not is_float(first.access.kind):
+                new = w.value(f"add {kind} {old}, {value}")
+            else:
+                new = w.value(f"fadd {kind} {old}, {value}")
+                if length == 1:
+                    new = _flushed_scalar(ctx, first.access, new)
+                elif first.access.kind == "f32" and first.access.space != "shared" and ctx.explicit_ftz:
+                    lanes, w.lanes = w.lanes, length
+                    new = flush(w, new)
+                    w.lanes = lanes
+            w.store(kind, new, pointer, size)
+
+    _for_each_lane(ctx, mask, body)
+
+
+def _stage(ctx: SegmentBody, run: list[Deferred]) -> str:
+    """Put the values of a run into memory so that those of one lane stand together."""
+    w, n = ctx.w, ctx.w.lanes
+    element = ELEMENT[run[0].access.kind]
+    size = ELEMENT_BYTES[element]
+    buffer = w.buffer(n * size * len(run))
+    values = [entry.value for entry in run]
+    align = min(64, n * size)
+    if len(run) == 4:
+        for row, column in enumerate(w.transpose4(element, values)):
+            w.store(w.vector(element), column, w.at(buffer, row * n * size), align)
+    elif len(run) == 2:
+        for half in range(2):
+            lanes = range(half * n // 2, (half + 1) * n // 2)
+            pairs = w.shuffle(element, values[0], values[1], [i for lane in lanes for i in (lane, lane + n)])
+            w.store(w.vector(element), pairs, w.at(buffer, half * n * size), align)
+    else:
+        w.store(w.vector(element), values[0], buffer, align)
+    return buffer

@@ -1,0 +1,250 @@
+"""Operations among the lanes of a warp, and barriers: on all 32 lanes at once, on registers in their slots."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from mpmbench.simt import scheduler
+from mpmbench.simt.codegen_arith import ELEMENT, Refused
+from mpmbench.simt.codegen_ir import WARP, Writer, bits_of
+from mpmbench.simt.ptx import Imm, Instruction, NotReg, Operand, Reg
+
+if TYPE_CHECKING:
+    from mpmbench.simt.codegen import _Generator
+
+_COLLECTIVES = frozenset({"shfl", "vote", "match", "redux", "activemask"})
+
+
+def is_barrier(item: Instruction) -> bool:
+    return item.root in ("bar", "barrier") and "warp" not in item.modifiers
+
+
+def is_warp_barrier(item: Instruction) -> bool:
+    return item.root in ("bar", "barrier") and "warp" in item.modifiers
+
+
+def is_collective(item: Instruction) -> bool:
+    return item.root in _COLLECTIVES or is_warp_barrier(item)
+
+
+def check_barrier(item: Instruction) -> None:
+    """Only the barrier of the whole thread block is supported: ``bar.sync 0`` and its newer spellings."""
+    plain = set(item.modifiers) <= {"sync", "cta", "aligned"} and "sync" in item.modifiers
+    if not plain or len(item.srcs) != 1 or item.srcs[0] != Imm(0):
+        raise Refused
+
+
+@contextmanager
+def whole_warp(w: Writer) -> Iterator[None]:
+    """Write code for vectors of 32 lanes."""
+    lanes, w.lanes = w.lanes, WARP
+    try:
+        yield
+    finally:
+        w.lanes = lanes
+
+
+def emit_collective(g: _Generator, number: int, item: Instruction, warp_mask: str) -> None:
+    """mask: lanes that execute the instruction together."""
+    with whole_warp(g.w):
+        _Collective(g, number, item, warp_mask).emit()
+
+
+class _Collective:
+    def __init__(self, g: _Generator, number: int, item: Instruction, warp_mask: str) -> None:
+        self.g, self.w, self.number, self.item = g, g.w, number, item
+        self.mask = warp_mask
+        if item.guard is not None:
+            guard = self._predicate_bits(item.guard)
+            if item.negated:
+                guard = self.w.value(f"xor i32 {guard}, -1")
+            self.mask = self.w.value(f"and i32 {guard}, {warp_mask}")
+        self.mask_vector = self.w.value(f"bitcast i32 {self.mask} to <32 x i1>")
+
+    def emit(self) -> None:
+        item = self.item
+        if item.root == "activemask":
+            self._write(0, self.w.splat("i32", self.mask), "i32")
+        elif is_warp_barrier(item):
+            self._check_members(item.srcs[0])
+            if self.g.mode == "debug":
+                address = self.w.at("%context", scheduler.CONTEXT_WARP_EPOCH)
+                old = self.w.load("i64", address, 8)
+                self.w.store("i64", self.w.value(f"add i64 {old}, 1"), address, 8)
+        elif "sync" not in item.modifiers:
+            raise Refused
+        else:
+            self._check_members(item.srcs[-1])
+            {"shfl": self._shuffle, "vote": self._vote, "match": self._match, "redux": self._reduce}[item.root]()
+
+    # --- operands ---
+
+    def _predicate_bits(self, operand: Operand) -> str:
+        """Predicate of 32 lanes as an i32."""
+        w = self.w
+        if isinstance(operand, NotReg):
+            return w.value(f"xor i32 {self._predicate_bits(operand.reg)}, -1")
+        if isinstance(operand, Imm):
+            return "-1" if operand.value else "0"
+        assert isinstance(operand, Reg)
+        return w.load("i32", w.at("%context", self.g.slot[operand]), 4)
+
+    def _read(self, operand: Operand, kind: str) -> str:
+        w, element = self.w, ELEMENT[kind]
+        if isinstance(operand, Imm):
+            return w.splat_bits(element, operand.value)
+        if not isinstance(operand, Reg):
+            raise Refused
+        return w.load(w.vector(element), w.at("%context", self.g.slot[operand]), 64)
+
+    def _write(self, position: int, value: str, element: str) -> None:
+        dst = self.item.dsts[position]
+        if dst is None:
+            return
+        self.w.masked_store(element, value, self.w.at("%context", self.g.slot[dst]), self.mask_vector, 64)
+
+    def _write_predicate(self, position: int, bits: str) -> None:
+        dst = self.item.dsts[position]
+        if dst is None:
+            return
+        w = self.w
+        address = w.at("%context", self.g.slot[dst])
+        old = w.load("i32", address, 4)
+        changed = w.value(f"and i32 {w.value(f'xor i32 {old}, {bits}')}, {self.mask}")
+        w.store("i32", w.value(f"xor i32 {old}, {changed}"), address, 4)
+
+    def _check_members(self, operand: Operand) -> None:
+        """Every live lane that the member mask names must be here, and every lane here must be named."""
+        from mpmbench.simt.codegen import emit_fault
+
+        w = self.w
+        live = w.load("i32", w.at("%context", scheduler.CONTEXT_LIVE), 4)
+        if isinstance(operand, Imm):
+            named = str(operand.value & 0xFFFFFFFF)
+            missing = w.value(f"and i32 {w.value(f'and i32 {named}, {live}')}, {w.value(f'xor i32 {self.mask}, -1')}")
+            unnamed = w.value(f"and i32 {self.mask}, {w.value(f'xor i32 {named}, -1')}")
+            wrong = w.value(f"or i32 {missing}, {unnamed}")
+        else:
+            # A register may name another group in every lane: each lane's group must be here and contain the lane.
+            members = self._read(operand, "b32")
+            absent = w.splat("i32", w.value(f"and i32 {live}, {w.value(f'xor i32 {self.mask}, -1')}"))
+            missing_lanes = w.binary("and", "i32", members, absent)
+            own = w.binary("shl", "i32", w.splat_int("i32", 1), _lane_constant())
+            is_missing = w.compare("icmp ne", "i32", missing_lanes, w.splat_int("i32", 0))
+            is_unnamed = w.compare("icmp eq", "i32", w.binary("and", "i32", members, own), w.splat_int("i32", 0))
+            bits = w.value(f"bitcast <32 x i1> {w.binary('or', 'i1', is_missing, is_unnamed)} to i32")
+            wrong = w.value(f"and i32 {bits}, {self.mask}")
+        some = w.value(f"icmp ne i32 {wrong}, 0")
+        emit_fault(self.g, some, scheduler.FAULT_MASK, self.number)
+
+    # --- operations ---
+
+    def _shuffle(self) -> None:
+        """PTX ISA 9.7.9.6: bits 8..12 of the third operand cut the warp into segments, bits 0..4 clamp."""
+        w, item = self.w, self.item
+        mode = item.modifiers[1]
+        value = item.srcs[0]
+        amount = w.binary("and", "i32", self._read(item.srcs[1], "b32"), w.splat_int("i32", 31))
+        control = self._read(item.srcs[2], "b32")
+        clamp = w.binary("and", "i32", control, w.splat_int("i32", 31))
+        segment = w.binary(
+            "and", "i32", w.binary("lshr", "i32", control, w.splat_int("i32", 8)), w.splat_int("i32", 31)
+        )
+        free = w.binary("xor", "i32", segment, w.splat_int("i32", -1))
+        lane = _lane_constant()
+        low = w.binary("and", "i32", lane, segment)
+        high = w.binary("or", "i32", low, w.binary("and", "i32", clamp, free))
+        if mode == "up":
+            source = w.binary("sub", "i32", lane, amount)
+        elif mode == "down":
+            source = w.binary("add", "i32", lane, amount)
+        elif mode == "bfly":
+            source = w.binary("xor", "i32", lane, amount)
+        elif mode == "idx":
+            source = w.binary("or", "i32", low, w.binary("and", "i32", amount, free))
+        else:
+            raise Refused
+        inside = w.compare("icmp sge" if mode == "up" else "icmp sle", "i32", source, high)
+        source = w.select("i32", inside, source, lane)
+        if isinstance(value, Reg):
+            base = w.at("%context", self.g.slot[value])
+            pointers = w.value(f"getelementptr i32, ptr {base}, <32 x i32> {source}")
+            w.declare("declare <32 x i32> @llvm.masked.gather.v32i32.v32p0(<32 x ptr>, <32 x i1>, <32 x i32>)")
+            result = w.value(
+                f"call <32 x i32> @llvm.masked.gather.v32i32.v32p0(<32 x ptr> align 4 {pointers}, "
+                "<32 x i1> splat (i1 true), <32 x i32> zeroinitializer)"
+            )
+        else:
+            result = self._read(value, "b32")
+        self._write(0, result, "i32")
+        if len(item.dsts) > 1:
+            self._write_predicate(1, w.value(f"bitcast <32 x i1> {inside} to i32"))
+
+    def _vote(self) -> None:
+        w, item = self.w, self.item
+        mode = item.modifiers[1]
+        held = w.value(f"and i32 {self._predicate_bits(item.srcs[0])}, {self.mask}")
+        if mode == "ballot":
+            self._write(0, w.splat("i32", held), "i32")
+            return
+        some = w.value(f"icmp ne i32 {held}, 0")
+        every = w.value(f"icmp eq i32 {held}, {self.mask}")
+        if mode == "uni":
+            outcome = w.value(f"or i1 {every}, {w.value(f'icmp eq i32 {held}, 0')}")
+        else:
+            outcome = {"any": some, "all": every}[mode]
+        self._write_predicate(0, w.value(f"sext i1 {outcome} to i32"))
+
+    def _match(self) -> None:
+        """``any``: the lanes with this lane's value. ``all``: all lanes if they agree, else none; and a predicate."""
+        w, item = self.w, self.item
+        kind = item.modifiers[-1]
+        element = ELEMENT[kind]
+        size = bits_of(element) // 8
+        operand = item.srcs[0]
+        values = self._read(operand, kind)
+        results = w.buffer(4 * WARP)
+        if not isinstance(operand, Reg):
+            raise Refused
+        for lane in range(WARP):
+            scalar = w.load(element, w.at("%context", self.g.slot[operand] + size * lane), size)
+            same = w.compare("icmp eq", element, values, w.splat(element, scalar))
+            bits = w.value(f"and i32 {w.value(f'bitcast <32 x i1> {same} to i32')}, {self.mask}")
+            w.store("i32", bits, w.at(results, 4 * lane), 4)
+        groups = w.load("<32 x i32>", results, 64)
+        if "any" in item.modifiers:
+            self._write(0, groups, "i32")
+            return
+        whole = w.compare("icmp eq", "i32", groups, w.splat("i32", self.mask))
+        self._write(0, w.select("i32", whole, groups, w.splat_int("i32", 0)), "i32")
+        if len(item.dsts) > 1:
+            self._write_predicate(1, w.value(f"bitcast <32 x i1> {whole} to i32"))
+
+    def _reduce(self) -> None:
+        w, item = self.w, self.item
+        operation, kind = item.modifiers[-2:]
+        if kind not in ("s32", "u32", "b32"):
+            raise Refused
+        letter = "s" if kind == "s32" else "u"
+        name = f"{letter}{operation}" if operation in ("min", "max") else operation
+        neutral = {
+            "add": 0,
+            "or": 0,
+            "xor": 0,
+            "and": -1,
+            "umin": -1,
+            "umax": 0,
+            "smin": 2**31 - 1,
+            "smax": -(2**31),
+        }
+        value = self._read(item.srcs[0], kind)
+        masked = w.select("i32", self.mask_vector, value, w.splat_int("i32", neutral[name]))
+        w.declare(f"declare i32 @llvm.vector.reduce.{name}.v32i32(<32 x i32>)")
+        total = w.value(f"call i32 @llvm.vector.reduce.{name}.v32i32(<32 x i32> {masked})")
+        self._write(0, w.splat("i32", total), "i32")
+
+
+def _lane_constant() -> str:
+    return "<" + ", ".join(f"i32 {lane}" for lane in range(WARP)) + ">"
