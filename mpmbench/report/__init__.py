@@ -23,8 +23,8 @@ def write_report(records: Sequence[Record], html: Path | None = None, markdown: 
 
 def html_text(records: Sequence[Record]) -> str:
     """The page: as much detail as fits."""
-    for detail, most_rows in ((3, None), (2, None), (1, None), (0, None), (0, 200), (0, 50), (0, 10)):
-        page = html.render(document.build(records, detail, most_rows))
+    for extent in document.EXTENTS:
+        page = html.render(document.build(records, extent))
         if len(page.encode()) <= HTML_LIMIT:
             break
     return page

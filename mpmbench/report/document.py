@@ -68,11 +68,35 @@ class Document:
     left_out: tuple[str, ...] = field(default=())
 
 
-def build(records: Sequence[Record], detail: int = 3, most_rows: int | None = None) -> Document:
-    """detail: 3 everything, 2 without hottest lines, 1 without steps either, 0 without charts either.
+@dataclass(frozen=True)
+class Extent:
+    """How much a document holds.
 
-    most_rows: of a table, the best ones; every row where None.
+    charts: how many groups get them; drawing takes time.  rows: of a table, the best ones.  groups: how many get a
+    section, in the order run; the summary still has all.
     """
+
+    hottest: bool = True
+    steps: bool = True
+    charts: int = 24
+    rows: int | None = None
+    groups: int | None = None
+
+
+# From everything to what always fits.
+EXTENTS = (
+    Extent(),
+    Extent(hottest=False),
+    Extent(hottest=False, steps=False),
+    Extent(hottest=False, steps=False, charts=0),
+    Extent(hottest=False, steps=False, charts=0, rows=200, groups=100),
+    Extent(hottest=False, steps=False, charts=0, rows=40, groups=40),
+    Extent(hottest=False, steps=False, charts=0, rows=10, groups=10),
+)
+
+
+def build(records: Sequence[Record], extent: Extent = EXTENTS[0]) -> Document:
+    """What a report of these records says."""
     if not records:
         raise InputError("no records to report: run something first")
     records = list(records)
@@ -81,7 +105,10 @@ def build(records: Sequence[Record], detail: int = 3, most_rows: int | None = No
     if published := tables.presets(records):
         sections.append(Section("Published tables, and the same rows here", tuple(published)))
     several_devices = len({g.device for g in groups}) > 1
-    sections += [_group_section(g, detail, several_devices) for g in groups]
+    sections += [
+        _group_section(g, extent, charted=i < extent.charts, name_device=several_devices)
+        for i, g in enumerate(groups[: extent.groups])
+    ]
     sections.append(Section("Agreement with the float64 reference", (_untitled(tables.agreement(records)),)))
     for title, found in (
         ("Runs without a rank", tables.skipped(records)),
@@ -91,9 +118,14 @@ def build(records: Sequence[Record], detail: int = 3, most_rows: int | None = No
     ):
         if found:
             sections.append(Section(title, (_untitled(found),)))
-    if most_rows is not None:
-        sections = [replace(s, tables=tuple(_shortened(t, most_rows) for t in s.tables)) for s in sections]
-    left_out = ("hottest lines", "single steps", "charts")[: 3 - detail]
+    if extent.rows is not None:
+        sections = [replace(s, tables=tuple(_shortened(t, extent.rows) for t in s.tables)) for s in sections]
+    parts = {"hottest lines": extent.hottest, "single steps": extent.steps}
+    left_out = [name for name, shown in parts.items() if not shown]
+    if extent.charts < len(groups):
+        left_out.append(f"charts of {_plural(len(groups) - extent.charts, 'section')}")
+    if extent.groups is not None and len(groups) > extent.groups:
+        left_out.append(_plural(len(groups) - extent.groups, "section"))
     verdict, agreed = _verdict(records)
     return Document(
         title="mpmbench report",
@@ -104,7 +136,7 @@ def build(records: Sequence[Record], detail: int = 3, most_rows: int | None = No
         sections=tuple(sections),
         legend=_legend(sections),
         environment=_environment(records),
-        left_out=left_out,
+        left_out=tuple(left_out),
     )
 
 
@@ -250,21 +282,21 @@ def _where(places: list[str]) -> str:
 # ---- groups ------------------------------------------------------------------------------------------------
 
 
-def _group_section(g: Group, detail: int, name_device: bool) -> Section:
+def _group_section(g: Group, extent: Extent, charted: bool, name_device: bool) -> Section:
     details = []
     shown = [tables.ranking(g)]
     charts: list[Bars | Lines] = []
-    if len(g.ranked) > 1 and detail >= 1:
+    if len(g.ranked) > 1 and charted:
         charts = _bars(g) + _break_even_lines(g)
     if g.ranked:
         if g.simulated:
             shown.append(tables.counters(g))
         shown.append(tables.preprocessing(g))
     shown = [replace(t, title=t.title.replace(f". {g.title}", "").replace(f": {g.title}", "")) for t in shown]
-    if detail >= 2 and (found := tables.steps(g)):
+    if extent.steps and (found := tables.steps(g)):
         found = [replace(t, title=t.title.replace(f": {g.title}", "")) for t in found]
         details.append(Details("Each step around the transfer on its own", tuple(found)))
-    if detail >= 3 and g.simulated:
+    if extent.hottest and g.simulated:
         hottest = [t for r in g.ranked if (t := tables.hottest_lines(r, g.label(r)))]
         if hottest:
             summary = "Hottest source lines of each strategy: simulated, not time"

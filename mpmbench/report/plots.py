@@ -10,6 +10,7 @@ import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 from mpmbench.report.text import number
@@ -54,8 +55,9 @@ class Lines:
     lines: tuple[Line, ...]
 
 
+@lru_cache(maxsize=256)
 def svg(chart: Bars | Lines) -> str:
-    """An ``<svg>`` element."""
+    """An ``<svg>`` element. Kept, as a page that comes out too large is laid out again with less on it."""
     import matplotlib
 
     style: dict[Any, Any] = {
