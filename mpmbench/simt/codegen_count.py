@@ -22,6 +22,17 @@ PART_WORDS = 4
 PARTS = ("global", "shared", "local")
 
 
+SUPPORT_FUNCTIONS = (
+    "count_global",
+    "count_atomics",
+    "count_shared_atomics",
+    "count_shared_4",
+    "count_shared_8",
+    "count_shared_16",
+    "count_local",
+)
+
+
 def counter_words(segments: int, sites: int) -> int:
     return SEGMENT_WORDS * segments + SITE_WORDS * sites
 

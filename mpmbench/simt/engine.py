@@ -113,8 +113,9 @@ class Kernel:
             stored = _pack(*self._compile())
             cache.store("kernel", key, stored)
         self.facts, machine_code = _unpack(stored)
-        support = (_support_object(),) if mode == "count" else ()
-        self._code = native.LoadedCode(machine_code, *support)
+        if mode == "count":
+            _load_support()
+        self._code = native.LoadedCode(machine_code)
         self._launch = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p)(self._code.address("launch"))
 
     def _compile(self) -> tuple[_Description, bytes]:
@@ -335,10 +336,13 @@ def _unpack(stored: bytes) -> tuple[_Description, bytes]:
 
 
 @functools.cache
-def _support_object() -> bytes:
+def _load_support() -> native.LoadedCode:
+    """Make the counting functions known to kernels that are loaded later."""
     key = cache.content_key("support", native.machine_identity())
     stored = cache.load("kernel", key)
     if stored is None:
         stored = native.compile_text(codegen_count.support_text())
         cache.store("kernel", key, stored)
-    return stored
+    code = native.LoadedCode(stored)
+    code.export(codegen_count.SUPPORT_FUNCTIONS)
+    return code

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import ctypes.util
 import functools
+from collections.abc import Sequence
 from pathlib import Path
 
 import llvmlite
@@ -57,10 +58,10 @@ def compile_text(text: str) -> bytes:
 
 
 class LoadedCode:
-    """Object files linked into this process."""
+    """An object file linked into this process."""
 
-    def __init__(self, *objects: bytes) -> None:
-        machine, _ = _target()
+    def __init__(self, data: bytes) -> None:
+        _target()
         # An execution engine takes over its target machine, so it gets one of its own.
         own = llvm.Target.from_default_triple().create_target_machine(
             cpu=llvm.get_host_cpu_name(),
@@ -68,11 +69,14 @@ class LoadedCode:
             reloc="pic",
             codemodel="jitdefault",
         )
-        del machine
         self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), own)
-        for data in objects:
-            self._engine.add_object_file(llvm.ObjectFileRef.from_data(data))
+        self._engine.add_object_file(llvm.ObjectFileRef.from_data(data))
         self._engine.finalize_object()
 
     def address(self, function: str) -> int:
         return self._engine.get_function_address(function)
+
+    def export(self, functions: Sequence[str]) -> None:
+        """Let objects that are loaded later call these functions."""
+        for name in functions:
+            llvm.add_symbol(name, self.address(name))
