@@ -63,7 +63,7 @@ class Row:
 
 ROWS = (
     Row("P2G sorted, uniform_cube", "p2g", "uniform_cube", True, "p2g_global_atomic", 1.5),
-    Row("P2G block_sync, uniform_cube (peers: P2G sorted)", "p2g", "uniform_cube", True, "p2g_block_sync", 3.75),
+    Row("P2G sorted, uniform_cube: block_sync (peers as above)", "p2g", "uniform_cube", True, "p2g_block_sync", 3.75),
     Row("P2G random order, uniform_cube", "p2g", "uniform_cube", False, "p2g_global_atomic", 1.0),
     Row("G2P sorted, uniform_cube", "g2p", "uniform_cube", True, "g2p_global_gather", 0.7),
     Row("G2P random order, uniform_cube", "g2p", "uniform_cube", False, "g2p_global_gather", 1.0),

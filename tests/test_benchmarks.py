@@ -203,7 +203,7 @@ def test_table_has_a_time_for_the_engine_and_reasons_for_wrong_and_missing_peers
         assert row["excluded"]["Taichi"] == "not here"
         assert row["excluded"]["Warp"].startswith("FAILED")
     text = (tmp_path / "engine_vs_cpu.md").read_text()
-    assert text == capsys.readouterr().out.removesuffix("\n")
+    assert text in capsys.readouterr().out
     assert "measured (wall, CPU)" in text
     assert "- Taichi: no time, not here" in text
 
