@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from mpmbench.errors import InputError
-from mpmbench.simt import codegen_count, codegen_memory, codegen_warp, scheduler
+from mpmbench.simt import codegen_count, codegen_memory, codegen_rare, codegen_warp, scheduler
 from mpmbench.simt.address_forms import AddressForms
 from mpmbench.simt.codegen_arith import ELEMENT, EMITTERS, Refused, is_float_arithmetic
 from mpmbench.simt.codegen_ir import ELEMENT_BYTES, WARP, Writer, bits_of, element_of, integer_of
@@ -529,6 +529,8 @@ class SegmentBody:
         elif item.root in _NOTHING:
             if item.root in ("membar", "fence"):
                 codegen_memory.flush_deferred(self)
+        elif codegen_rare.emit(self, item):
+            pass
         elif item.root in EMITTERS:
             EMITTERS[item.root](self, item)
         else:

@@ -2,7 +2,7 @@
 
 Semantics: PTX ISA 8.8, chapter 9.7. IEEE operations are exact (LLVM ``fadd``, ``llvm.fma``, ... without fast-math
 flags); ``.approx`` forms are at least as accurate as the ISA promises. Results that the ISA leaves open: an integer
-quotient by zero is all ones and the remainder is the dividend; NaN results are quiet but keep the CPU's payload.
+quotient and remainder by zero are all ones, as on NVIDIA hardware; NaN results are quiet but keep the CPU's payload.
 """
 
 from __future__ import annotations
@@ -264,7 +264,7 @@ def _quotient(ctx: Lanes, item: Instruction, kind: str) -> tuple[str, str]:
     remainder = w.binary("sub", element, a, w.binary("mul", element, quotient, safe))
     return (
         w.select(element, by_zero, w.splat_int(element, -1), quotient),
-        w.select(element, by_zero, a, remainder),
+        w.select(element, by_zero, w.splat_int(element, -1), remainder),
     )
 
 

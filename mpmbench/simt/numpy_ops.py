@@ -346,7 +346,8 @@ def _gross(compute: Callable[[Array], Array]) -> LaneOp:
         upper = np.uint64(0xFFFFFFFF00000000)
         with np.errstate(all="ignore"):
             result = canonical(compute(flush64((x.view(np.uint64) & upper).view(np.float64))))
-        return (flush64(result).view(np.uint64) & upper).view(np.float64)
+        cut = (flush64(result).view(np.uint64) & upper).view(np.float64)
+        return np.where(np.isnan(x), canonical(x), cut)
 
     return LaneOp(("f64",), ("f64",), apply)
 

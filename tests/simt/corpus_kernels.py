@@ -41,6 +41,18 @@ def form(item: ptx.Instruction) -> str:
     return item.opcode + shape
 
 
+@functools.cache
+def forms() -> dict[str, ptx.Instruction]:
+    """Every form of instruction in the corpus, with an example."""
+    found: dict[str, ptx.Instruction] = {}
+    for arch in ARCHS:
+        for stem in FILES:
+            for kernel in module(stem, arch).kernels.values():
+                for item in kernel.instructions:
+                    found.setdefault(form(item), item)
+    return found
+
+
 SPECIAL_F32 = np.array(
     [0x00000000, 0x80000000, 0x3F800000, 0xBF800000, 0x7F800000, 0xFF800000, 0x7FC00000, 0xFFC00001, 0x7F800001]
     + [0x00000001, 0x80000001, 0x007FFFFF, 0x807FFFFF, 0x00800000, 0x80800000, 0x7F7FFFFF, 0xFF7FFFFF, 0x3F000000]

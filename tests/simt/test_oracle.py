@@ -46,9 +46,7 @@ def exact(compute, dtype, mode, *operands) -> float:
 def test_rounded_arithmetic_agrees_with_exact_fractions(dtype, mode):
     rng = np.random.default_rng(5)
     spread = 30 if dtype == "f4" else 200
-    a, b, c = (
-        (rng.normal(size=400) * 2.0 ** rng.integers(-spread, spread, 400)).astype(dtype) for _ in range(3)
-    )
+    a, b, c = ((rng.normal(size=400) * 2.0 ** rng.integers(-spread, spread, 400)).astype(dtype) for _ in range(3))
     c[:200] = -(a * b)[:200]  # cancellation: what a fused multiply-add is for
     cases = {
         "add": (lambda x, y: x + y, (a, b)),
@@ -78,7 +76,12 @@ def test_sums_that_cancel_are_minus_zero_only_when_rounding_down():
         for mode in ("rn", "rz", "rp"):
             got = numpy_rounding.add(x.astype(wide), y.astype(wide), mode)
             assert np.signbit(got).tolist() == [False, False, True, False]
-        assert np.signbit(numpy_rounding.add(x.astype(wide), y.astype(wide), "rm")).tolist() == [True, True, True, False]
+        assert np.signbit(numpy_rounding.add(x.astype(wide), y.astype(wide), "rm")).tolist() == [
+            True,
+            True,
+            True,
+            False,
+        ]
         one = np.ones(4, wide)
         fused = numpy_rounding.fma(x.astype(wide), one, y.astype(wide), "rm")
         assert np.signbit(fused).tolist() == [True, True, True, False]
@@ -181,7 +184,20 @@ def test_compiled_integer_arithmetic_is_that_of_c(kind):
         a, b, c = (wrap(x, bits, signed) for x in (given[0], given[1] | 1, given[2]))
         quotient = abs(a) // abs(b) * (1 if (a < 0) == (b < 0) else -1)
         by = b & 7
-        expected = [a + b, a - b, a * b, quotient, a - quotient * b, a * b + c, a & b, a | b, a ^ b, ~a, a << by, a >> by]
+        expected = [
+            a + b,
+            a - b,
+            a * b,
+            quotient,
+            a - quotient * b,
+            a * b + c,
+            a & b,
+            a | b,
+            a ^ b,
+            ~a,
+            a << by,
+            a >> by,
+        ]
         expected += [min(a, b), max(a, b), None, -a, abs(a) if signed else a, int(a == 0)]
         for number, value in enumerate(expected):
             if value is not None:
