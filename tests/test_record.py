@@ -114,6 +114,17 @@ def test_a_torn_last_row_is_dropped_with_a_warning(tmp_path, simulated, keep):
     assert read_records(path) == [simulated, simulated]
 
 
+def test_nothing_of_a_torn_row_is_left_behind_a_shorter_one(tmp_path, simulated):
+    path = tmp_path / "r.jsonl"
+    path.write_text(to_json(simulated)[:-1])
+    short = dataclasses.replace(
+        simulated, transfer_counters=None, preprocess={}, line_texts={}, check=None, failed_because="x"
+    )
+    with pytest.warns(UserWarning, match="torn"), RecordWriter(path, existing="append") as writer:
+        writer.write(short)
+    assert path.read_text() == to_json(short) + "\n"
+
+
 def test_a_row_without_its_newline_is_kept_and_appended_to(tmp_path, simulated):
     path = tmp_path / "r.jsonl"
     path.write_text(to_json(simulated))
@@ -250,6 +261,7 @@ def test_summaries_take_numpy_values(simulated):
 
     summary = DatasetSummary.of(Dataset)
     assert summary.n == 5
+    assert summary.statistics["histogram"] == [0, 1, 2]
     back = from_json(to_json(dataclasses.replace(simulated, check=check, dataset=summary)))
     assert math.isnan(back.dataset.statistics["mean"])
     assert back.dataset.statistics["histogram"] == [0, 1, 2]

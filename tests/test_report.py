@@ -19,7 +19,7 @@ from mpmbench.grid import Grid
 from mpmbench.record import Check, DatasetSummary, Measurement, Record, StepCost
 from mpmbench.report import document, html_text, markdown_text, plots, write_report
 from mpmbench.report import table as tables
-from mpmbench.report.markdown import escape
+from mpmbench.report.markdown import code, escape
 from mpmbench.report.table import Cell, Column, Kind, Quantity, Row, Split, Table, break_even
 from mpmbench.report.text import format_value
 from mpmbench.simt.counters import Counters, Finding, SourceLine, Tally
@@ -155,6 +155,7 @@ def test_only_what_is_comparable_is_compared():
         simulated(axes={"dtype": "float64"}),
         simulated(arch="sm_90"),
         measured(simulated(), 1e-3),
+        dataclasses.replace(measured(simulated(), 1e-3), arch="sm_52", environment=ENVIRONMENT),
     ]
     assert [len(g.records) for g in tables.group(records)] == [1] * len(records)
     assert [len(g.records) for g in tables.group(strategies())] == [4]
@@ -376,6 +377,7 @@ def test_odd_names_stay_text_in_markdown():
         widths = {len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines()}
         assert len(widths) == 1
     assert escape("a_b*c") == r"a\_b\*c"
+    assert code("a ``b` c") == "``` a ``b` c ```"
 
 
 # ---- HTML ----------------------------------------------------------------------------------------------------------
@@ -469,7 +471,9 @@ def test_a_large_report_sheds_details_and_says_so(monkeypatch):
 
 
 def test_pages_do_not_change_from_run_to_run():
-    assert html_text(strategies()) == html_text(strategies())
+    first = html_text(strategies())
+    plots.svg.cache_clear()
+    assert html_text(strategies()) == first
 
 
 def test_charts_show_their_values_as_text():
@@ -505,7 +509,7 @@ def test_a_full_disk_leaves_the_old_report(tmp_path, monkeypatch):
     path.write_text("old")
 
     def full(self: Path, text: str, **options) -> None:
-        self.touch()
+        self.write_bytes(b"")
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(Path, "write_text", full)

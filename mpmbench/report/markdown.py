@@ -59,7 +59,7 @@ def _table(table: Table) -> list[str]:
         cells = []
         for c, (cell, column) in enumerate(zip(row.cells, table.columns, strict=True)):
             text = format_value(cell.value, column.quantity)
-            text = _code(text) if column.quantity is Quantity.CODE else escape(text)
+            text = code(text) if column.quantity is Quantity.CODE else escape(text)
             cells.append(f"**{text}**" if i in best[c] and text else text)
         rows.append(cells)
     align = ["left" if column.quantity in LEFT else "right" for column in table.columns]
@@ -68,7 +68,7 @@ def _table(table: Table) -> list[str]:
     return parts
 
 
-def _code(text: str) -> str:
+def code(text: str) -> str:
     """A code span that survives back-ticks, bars and line breaks in the text."""
     if not text:
         return ""
@@ -81,7 +81,7 @@ def _code(text: str) -> str:
 def _with_code(text: str) -> str:
     """Text whose back-ticked words are code."""
     pieces = text.split("`")
-    return "".join(_code(piece) if i % 2 else _kept_spaces(piece) for i, piece in enumerate(pieces))
+    return "".join(code(piece) if i % 2 else _kept_spaces(piece) for i, piece in enumerate(pieces))
 
 
 def _kept_spaces(text: str) -> str:
