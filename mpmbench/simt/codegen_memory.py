@@ -113,7 +113,7 @@ def emit_access(ctx: SegmentBody, index: int, item: Instruction) -> None:
         return
     if item.root in ("atom", "red"):
         values = [operand for operand in item.srcs if not isinstance(operand, Address)]
-        used = bool(item.dsts) and item.dsts[0] is not None and item.dsts[0] in ctx.live_after(index)
+        used = any(dst is not None and dst in ctx.live_after(index) for dst in item.dsts)
         if access.operation == "add" and not used and access.count == 1:
             _defer_add(ctx, index, access, address, values[0])
         else:
@@ -220,7 +220,8 @@ def _load(ctx: SegmentBody, index: int, item: Instruction, access: Access, addre
     if access.count == 4 and access.width == 16:
         values = _load_quads(ctx, index, access, address, element)
     elif access.width in (1, 2):
-        values = [_load_small(ctx, index, access, address, element)]
+        whole = _load_small(ctx, index, access, address, f"i{8 * access.width}")
+        values = _split(ctx, whole, 8 * access.width, access.count, element)
     elif access.width in (4, 8):
         whole = _gather(ctx, _place(ctx, index, access.space, address), f"i{8 * access.width}", access.width)
         values = _split(ctx, whole, 8 * access.width, access.count, element)
@@ -305,8 +306,6 @@ def _concatenate(ctx: SegmentBody, parts: Sequence[str], element: str) -> str:
 def _load_small(ctx: SegmentBody, index: int, access: Access, address: Address, element: str) -> str:
     """One or two bytes per lane."""
     w = ctx.w
-    if access.count != 1:
-        raise Refused
     buffer, displacement, base, _, _ = _address_buffer(ctx, index, access.space, address)
     result = w.buffer(8 * WARP)
     size = ELEMENT_BYTES[element]
@@ -354,7 +353,8 @@ def _store(ctx: SegmentBody, index: int, item: Instruction, access: Access, addr
     if access.count == 4 and access.width == 16:
         _store_quads(ctx, index, access, address, element, values)
     elif access.width in (1, 2):
-        _store_small(ctx, index, access, address, element, values[0])
+        whole = _join(ctx, values, 8 * access.width, element)
+        _store_small(ctx, index, access, address, f"i{8 * access.width}", whole)
     elif access.width in (4, 8):
         whole = _join(ctx, values, 8 * access.width, element)
         _scatter(ctx, _place(ctx, index, access.space, address), f"i{8 * access.width}", access.width, whole)
@@ -412,8 +412,6 @@ def _store_quads(
 
 def _store_small(ctx: SegmentBody, index: int, access: Access, address: Address, element: str, value: str) -> None:
     w = ctx.w
-    if access.count != 1:
-        raise Refused
     buffer, displacement, base, _, _ = _address_buffer(ctx, index, access.space, address)
     size = ELEMENT_BYTES[element]
     values = w.buffer(8 * WARP)
@@ -464,29 +462,46 @@ def _atomic(
     used: bool,
 ) -> None:
     """Lane after lane: read, combine, write; the old values are the result."""
-    if access.count != 1 or ELEMENT_BYTES[ELEMENT[access.kind]] < 4:
-        raise Refused
     w, element = ctx.w, ELEMENT[access.kind]
     size = ELEMENT_BYTES[element]
-    values = []
-    for operand in operands:
-        buffer = w.buffer(8 * WARP)
-        w.store(w.vector(element), ctx.read(operand, access.kind), buffer, min(64, size * w.lanes))
-        values.append(buffer)
+    if size < 4 and access.operation != "cas":
+        raise Refused
+    align = min(64, size * w.lanes)
+    # The operands of every element; a vector atomic has several.
+    columns = [operand.items if isinstance(operand, Vector) else (operand,) for operand in operands]
+    staged: list[list[str]] = []
+    for row in zip(*columns, strict=True):
+        buffers = []
+        for operand in row:
+            if operand is None:
+                raise Refused
+            buffers.append(w.buffer(8 * WARP))
+            w.store(w.vector(element), ctx.read(operand, access.kind), buffers[-1], align)
+        staged.append(buffers)
     _account(ctx, index, "atomic", access, address)
     addresses, displacement, base, _, _ = _address_buffer(ctx, index, access.space, address)
-    result = w.buffer(8 * WARP)
+    results = [w.buffer(8 * WARP) for _ in staged]
 
     def body(lane: str) -> None:
-        pointer = _lane_address(ctx, ctx.chunk_of(addresses), lane, base, displacement)
-        scalars = [w.load(element, w.value(f"getelementptr {element}, ptr {v}, i64 {lane}"), size) for v in values]
-        old = w.load(element, pointer, size)
-        w.store(element, _combine(ctx, access, element, old, scalars), pointer, size)
-        w.store(element, old, w.value(f"getelementptr {element}, ptr {result}, i64 {lane}"), size)
+        for position, (buffers, result) in enumerate(zip(staged, results, strict=True)):
+            at = displacement + position * size
+            pointer = _lane_address(ctx, ctx.chunk_of(addresses), lane, base, at)
+            values = [w.load(element, _lane_slot(ctx, element, buffer, lane), size) for buffer in buffers]
+            old = w.load(element, pointer, size)
+            w.store(element, _combine(ctx, access, element, old, values), pointer, size)
+            w.store(element, old, _lane_slot(ctx, element, result, lane), size)
 
     _for_each_lane(ctx, ctx.active_bits(), body)
     if used:
-        ctx.write(item, 0, w.load(w.vector(element), result, min(64, size * w.lanes)), element)
+        for position, result in enumerate(results):
+            dst = item.dsts[position]
+            if dst is not None:
+                old = w.load(w.vector(element), result, align)
+                _write_loaded(ctx, item, position, old, access.kind, dst)
+
+
+def _lane_slot(ctx: SegmentBody, element: str, buffer: str, lane: str) -> str:
+    return ctx.w.value(f"getelementptr {element}, ptr {buffer}, i64 {lane}")
 
 
 def _combine(ctx: SegmentBody, access: Access, element: str, old: str, values: Sequence[str]) -> str:
