@@ -67,7 +67,8 @@ def _rounded_call(w: Writer, operation: str, mode: str, sources: list[tuple[str,
     w.declare(
         f"define internal {result} @{name}({parameters}) noinline strictfp {{\n"
         f"call void @llvm.set.rounding(i32 {_MODES[mode]}) strictfp\n"
-        f'%r = call {result} @{intrinsic}({parameters}, metadata !"round.dynamic", metadata !"fpexcept.ignore") strictfp\n'
+        f"%r = call {result} @{intrinsic}({parameters}, "
+        'metadata !"round.dynamic", metadata !"fpexcept.ignore") strictfp\n'
         f"call void @llvm.set.rounding(i32 {_NEAREST}) strictfp\n"
         f"ret {result} %r\n}}"
     )

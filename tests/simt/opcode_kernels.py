@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import corpus_kernels as corpus
 import numpy as np
 
-from mpmbench.simt import numpy_ops, ptx
+from mpmbench.simt import numpy_ops
 
 THREADS = 512
 BLOCK = 128

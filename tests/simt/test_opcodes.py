@@ -3,7 +3,6 @@ that are empty, full, one lane and random."""
 
 from __future__ import annotations
 
-import corpus_kernels as corpus
 import numpy as np
 import opcode_kernels as opcodes
 import pytest
