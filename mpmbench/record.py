@@ -35,7 +35,7 @@ SCHEMA = 1  # raised when a reader of the old number would misread the new lines
 SUPPORT_NODES = {"linear": 8, "quadratic": 27, "cubic": 64}
 
 # Preprocessing that every transfer needs anew; the rest is done once per sort.
-PER_TRANSFER_STEPS = ("grid_clear",)
+PER_TRANSFER_STEPS = ("grid_clear", "grid_divide")
 
 
 @dataclass(frozen=True)

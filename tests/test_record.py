@@ -7,6 +7,7 @@ import errno
 import json
 import math
 import os
+import re
 
 import numpy as np
 import pytest
@@ -31,6 +32,7 @@ from mpmbench.record import (
     total_cost,
 )
 from mpmbench.simt.counters import Counters, Finding, SourceLine, Tally
+from mpmbench.simt.nvrtc import compile_cuda
 
 
 @pytest.fixture(scope="module")
@@ -245,6 +247,20 @@ def test_line_texts_follow_line_marks():
     source = '#define N 4\n#line 1 "k.cu"\nint a;\n  int b;\n#line 7 "common.cuh"\nint c;\n#line 5 "k.cu"\nint d;'
     wanted = [SourceLine("k.cu", 2), SourceLine("common.cuh", 7), SourceLine("k.cu", 5), SourceLine("k.cu", 99)]
     assert line_texts(source, wanted) == {wanted[0]: "int b;", wanted[1]: "int c;", wanted[2]: "int d;"}
+
+
+def test_a_compiled_kernel_names_its_lines_as_the_source_does(tmp_path, monkeypatch):
+    """Wherever it is compiled: a record must not depend on the working directory."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    text = '#line 1 "header.cuh"\n__device__ int twice(int x) { return 2 * x; }\n#line 1 "k.cu"\n'
+    text += 'extern "C" __global__ void k(int* a) {\n  a[threadIdx.x] = twice(a[threadIdx.x]);\n}\n'
+    ptx = compile_cuda(text, "sm_52", ("-lineinfo",), name="k.cu")
+    files = set(re.findall(r'\.file\s+\d+\s+"([^"]*)"', ptx))
+    assert files
+    assert files <= {"k.cu", "header.cuh"}
+    line = SourceLine("k.cu", 2)
+    assert line_texts(text, [line]) == {line: "a[threadIdx.x] = twice(a[threadIdx.x]);"}
 
 
 def test_summaries_take_numpy_values(simulated):

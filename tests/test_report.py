@@ -159,6 +159,8 @@ def test_only_what_is_comparable_is_compared():
     ]
     assert [len(g.records) for g in tables.group(records)] == [1] * len(records)
     assert [len(g.records) for g in tables.group(strategies())] == [4]
+    order = [(g.first.transfer, g.first.dataset.name) for g in tables.group([records[1], records[2], records[0]])]
+    assert order == [("p2g", "uniform_cube"), ("g2p", "uniform_cube"), ("p2g", "random")]
     assert len(tables.group([simulated(), simulated()])[0].records) == 1  # repeated, not compared with itself
 
 

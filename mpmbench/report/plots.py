@@ -21,9 +21,10 @@ SERIES = tuple(f"#03030{i}" for i in range(8))  # --series-0 ... --series-7
 MUTED = "#040404"
 DASHES = ("solid", (0, (5, 1.5)), (0, (1.5, 1)), (0, (6, 1.5, 1.5, 1.5)))
 
-WIDTH = 5.2  # [inch], drawn at 72 per inch: legible when scaled to a telephone's width
+WIDTH = 4.6  # [inch], drawn at 72 per inch: legible when scaled to a telephone's width
 BAR_HEIGHT = 0.42
 MOST_BARS = 20
+LONGEST_LABEL = 56  # characters that fit in the width
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ def _bars(chart: Bars) -> str:
         colour = MUTED if i == chart.highlight else SERIES[0]
         axes.barh(i, value, height=0.38, color=colour)
         # The name stands over its bar: beside it, there would be no room left on a narrow screen.
-        axes.text(0, i - 0.28, label, va="bottom", ha="left", fontsize=9)
+        axes.text(0, i - 0.28, _fit(label), va="bottom", ha="left", fontsize=9)
         axes.text(value + 0.012 * top, i, number(value), va="center", ha="left", fontsize=9)
     axes.set_xlim(0, 1.14 * top)
     axes.set_ylim(len(values) - 0.6, -0.9)
@@ -106,14 +107,14 @@ def _lines(chart: Lines) -> str:
     plot_height = 3.0
     height = plot_height + legend_height
     figure = Figure((WIDTH, height))
-    axes = figure.add_axes((0.12, (legend_height + 0.5) / height, 0.84, (plot_height - 0.62) / height))
+    axes = figure.add_axes((0.13, (legend_height + 0.5) / height, 0.83, (plot_height - 0.62) / height))
     series = 0
     for line in chart.lines:
         if line.baseline:
-            axes.plot(line.x, line.y, color=MUTED, linewidth=2.2, label=f"{line.label} (baseline)")
+            axes.plot(line.x, line.y, color=MUTED, linewidth=2.2, label=f"{_fit(line.label)} (baseline)")
         else:
             axes.plot(
-                line.x, line.y, color=SERIES[series % len(SERIES)], linewidth=1.6, label=line.label,
+                line.x, line.y, color=SERIES[series % len(SERIES)], linewidth=1.6, label=_fit(line.label),
                 linestyle=DASHES[series % len(DASHES)],
             )  # fmt: skip
             series += 1
@@ -133,6 +134,10 @@ def _lines(chart: Lines) -> str:
         labelspacing=0.35, borderpad=0, handlelength=2.6,
     )  # fmt: skip
     return _inline(figure, f"{chart.title}: {chart.axis}")
+
+
+def _fit(label: str) -> str:
+    return label if len(label) <= LONGEST_LABEL else f"{label[: LONGEST_LABEL - 1]}…"
 
 
 def _inline(figure: object, label: str) -> str:

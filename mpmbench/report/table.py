@@ -216,7 +216,17 @@ def group(records: Iterable[Record]) -> list[Group]:
         gpu = r.environment.gpu.get("name")
         key = (r.dataset.name, r.dataset.fingerprint, r.transfer, problem, r.device, gpu, r.arch)
         groups.setdefault(key, {})[(r.variant, tuple(sorted(r.axes.items(), key=str)))] = r
-    return [Group(tuple(sorted(runs.values(), key=_order))) for runs in groups.values()]
+    found = [Group(tuple(sorted(runs.values(), key=_order))) for runs in groups.values()]
+    datasets = list(dict.fromkeys((g.first.dataset.name, g.first.dataset.fingerprint) for g in found))
+    place = {dataset: i for i, dataset in enumerate(datasets)}
+    # P2G and G2P of a dataset side by side, datasets in the order run.
+    return sorted(
+        found,
+        key=lambda g: (
+            place[g.first.dataset.name, g.first.dataset.fingerprint],
+            list(BASELINES).index(g.first.transfer) if g.first.transfer in BASELINES else len(BASELINES),
+        ),
+    )
 
 
 def _order(record: Record) -> tuple[Any, ...]:
@@ -564,7 +574,11 @@ def preprocessing(g: Group) -> Table:
         unit = " / particle" if per_particle else ""
         parts = (
             ("per sort", lambda s: s.per_sort, "preprocessing done once per sort"),
-            ("per transfer", lambda s: s.per_transfer, "the transfer, and clearing the grid where it needs that"),
+            (
+                "per transfer",
+                lambda s: s.per_transfer,
+                "the transfer, with clearing the grid before P2G and dividing it before G2P",
+            ),
             ("total", lambda s: s.per_sort + s.per_transfer, "a sort and one transfer"),
         )
         for part, pick, explain in parts:

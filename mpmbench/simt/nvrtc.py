@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import importlib.util
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -29,10 +30,11 @@ def compile_cuda(text: str, arch: str, options: Sequence[str] = (), name: str = 
     arguments = list(options)
     if not any(option.startswith(("--gpu-architecture", "-arch")) for option in arguments):
         arguments.insert(0, f"--gpu-architecture={arch.replace('sm_', 'compute_')}")
-    key = cache.content_key("ptx", library.identity, name, text, *arguments)
+    key = cache.content_key("ptx, relative files", library.identity, name, text, *arguments)
     if (stored := cache.load("ptx", key)) is not None:
         return stored.decode()
-    ptx = library.compile(text, name, arguments)
+    # NVRTC puts the working directory before relative file names: the same text must give the same PTX anywhere.
+    ptx = library.compile(text, name, arguments).replace(f'"{os.getcwd().rstrip("/")}/', '"')
     cache.store("ptx", key, ptx.encode())
     return ptx
 
