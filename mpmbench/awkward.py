@@ -48,14 +48,16 @@ def awkward_datasets(spline: str | Spline = "cubic") -> dict[str, Dataset]:
     for count in (31, 33, 127, 1025):
         placed[f"size_{count}"] = (inside(f"size {count}", count), (16, 16, 16))
     datasets = {name: _dataset(name, xi, shape, uniform) for name, (xi, shape) in placed.items()}
-    shifted = _dataset(
-        "shifted_origin", inside("shifted", 300), (16, 16, 16), uniform, dx=0.37, origin=(-2.5, 0.1, 7.7)
-    )
+    # A step and an origin that no binary number holds: the dtype decides on which side of a face a particle lies.
+    dx, origin = 0.37, (-2.5, 0.1, 7.7)
+    shifted = _dataset("shifted_origin", inside("shifted", 300), (16, 16, 16), uniform, dx, origin)
+    on_rounded = 3 + np.floor(10 * uniform("rounded", 300, 3)) / 2
+    rounded = _dataset("faces_after_rounding", on_rounded, (16, 16, 16), uniform, dx, origin)
     # Twelve decades: what a heavy particle loses to rounding may not hide what is lost of a light one elsewhere.
     masses = _dataset(
         "huge_mass_ratio", inside("ratio", 300), (16, 16, 16), uniform, mass=10.0 ** (12 * uniform("decades", 300) - 8)
     )
-    datasets |= {"shifted_origin": shifted, "huge_mass_ratio": masses}
+    datasets |= {"shifted_origin": shifted, "faces_after_rounding": rounded, "huge_mass_ratio": masses}
     return datasets
 
 

@@ -47,7 +47,10 @@ G2P_QUANTITIES = (*(f"velocity {a}" for a in AXES), *(f"affine {a}{b}" for a in 
 
 @dataclass(frozen=True)
 class Conserved:
-    """Drift of one conserved total, and how much of it rounding explains; both relative to the total of magnitudes."""
+    """Drift of one conserved total, and how much of it rounding explains.
+
+    Both are relative to the total of magnitudes, sum m |v| for momentum, or absolute where that is zero.
+    """
 
     drift: float
     allowed: float
@@ -240,10 +243,9 @@ def _cross(moment: np.ndarray, sign: int = -1) -> np.ndarray:
 
 
 def _worst(off: np.ndarray, allowed: np.ndarray, magnitude: np.ndarray) -> Conserved:
-    """The component whose drift is worst, relative to ``magnitude``; where that is zero, the drift must be too."""
+    """The component whose drift is worst, relative to ``magnitude``; absolute where that is zero."""
     off = np.where(np.isfinite(off), np.abs(off), np.inf)
     ratio = np.divide(off, allowed, out=np.where(off > 0, np.inf, 0.0), where=allowed > 0)
     worst = int(np.argmax(ratio))
-    if magnitude[worst] == 0:
-        return Conserved(float(off[worst]), 0.0)
-    return Conserved(float(off[worst] / magnitude[worst]), float(allowed[worst] / magnitude[worst]))
+    scale = float(magnitude[worst]) or 1.0
+    return Conserved(float(off[worst]) / scale, float(allowed[worst]) / scale)

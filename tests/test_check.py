@@ -96,6 +96,12 @@ def test_either_cell_will_do_for_a_particle_on_a_face(spline):
         assert (emulation.node < SPLINES[spline].bin_node(dataset.node_units(np.float32))).any(axis=1).all()
         assert check_p2g(emulation.p2g(), nodes).passed
         assert check_g2p(emulation.g2p(field), particles).passed
+        # Also where the support is at rest and only the node below it moves.
+        beyond = np.zeros((9, 9, 9, 3))
+        beyond[3 - SPLINES[spline].left - 1] = 1
+        result = emulation.g2p(beyond)
+        assert result.velocity.any()
+        assert check_g2p(result, g2p(dataset, beyond, spline, payload, "float32")).passed
 
 
 # Each defect takes a correct float32 result to a wrong one. All must be refused, and stand out tenfold somewhere.
@@ -199,13 +205,13 @@ def test_mass_where_no_particle_reaches_is_refused():
     assert (verdict.passed, verdict.worst_node, verdict.allowed, verdict.ratio) == (False, (15, 15, 15), 0.0, np.inf)
 
 
-def test_a_small_loss_everywhere_is_refused_by_conservation():
-    dataset = load_dataset("random", particles=2000)  # at xi up to 126 a node may be off by more than a total
+def test_a_small_loss_everywhere_is_refused_by_conservation_alone():
+    dataset = load_dataset("uniform_cube", particles=32_000)  # around xi = 64 a node may be off by more than a total
     reference = p2g(dataset, "cubic", "pic", "float32")
     nodes = reference.nodes
-    share = 5e-5
+    share = 1.5e-5
     verdict = check_p2g(Nodes(nodes.mass * (1 - share), nodes.momentum), reference)
-    assert verdict.worst_error == pytest.approx(share * nodes.mass[verdict.worst_node])
+    assert verdict.ratio < 1
     assert not verdict.passed
     assert not verdict.conserved["mass"].passed
     assert verdict.conserved["mass"].drift == pytest.approx(share)
@@ -233,40 +239,93 @@ def test_angular_momentum_counts_the_affine_part():
         assert total.drift > 10 * total.allowed
 
 
+def on_a_node() -> Dataset:
+    """Random particles, the first one at rest on a node, where weights have no gradient but distances do."""
+    drawn = load_dataset("random", particles=30, grid_shape=(9, 7, 8), dx=0.5)
+    position, velocity = drawn.position.copy(), drawn.velocity.copy()
+    position[0], velocity[0] = (2.0, 1.5, 1.5), 0
+    return replace(drawn, position=position, velocity=velocity)
+
+
+def slopes(term, xi: np.ndarray) -> np.ndarray:
+    """Sum over the axes of |d term / d xi|, by central differences."""
+    h = 1e-6
+    return sum(np.abs(term(xi + e) - term(xi - e)) for e in h * np.eye(3)) / (2 * h)
+
+
 @pytest.mark.parametrize("spline", SPLINES)
-def test_sums_bound_every_term_by_brute_force(spline):
-    """The sums against a loop over all particles and nodes; affine ones may only be larger than the exact sums."""
-    dataset = load_dataset("random", particles=30, grid_shape=(9, 7, 8), dx=0.5)
-    xi, h = dataset.node_units(), 1e-6
+def test_sums_of_p2g_by_brute_force(spline):
+    """Exact for PIC; the affine ones bound the exact sums."""
+    dataset = on_a_node()
+    xi = dataset.node_units()
     pic, apic = (p2g(dataset, spline, payload, "float64").sums for payload in PAYLOADS)
     index = np.stack(np.indices(dataset.grid.shape), axis=-1)
-    weighted, gradient, affine_weighted = (np.zeros((4, *dataset.grid.shape)) for _ in range(3))
+    weighted, gradient, affine_weighted, affine_gradient = (np.zeros((4, *dataset.grid.shape)) for _ in range(4))
     terms = np.zeros(dataset.grid.shape)
     for p in range(30):
-        distance = xi[p] - index
-        w = textbook(spline, distance).prod(axis=-1)
-        step = np.eye(3) * h
-        slope = sum(
-            np.abs(textbook(spline, distance + e).prod(axis=-1) - textbook(spline, distance - e).prod(axis=-1))
-            for e in step
-        ) / (2 * h)
+
+        def weight(x):
+            return textbook(spline, x - index).prod(axis=-1)
+
+        def affine_term(x, p=p):
+            velocity = dataset.velocity[p] + (index - x) @ dataset.affine[p].T * dataset.grid.dx
+            return dataset.mass[p] * weight(x)[..., None] * velocity
+
         quantity = dataset.mass[p] * np.concatenate([[1], np.abs(dataset.velocity[p])])
-        weighted += quantity[:, None, None, None] * w
-        gradient += quantity[:, None, None, None] * slope
-        velocity = dataset.velocity[p] - distance @ dataset.affine[p].T * 0.5
-        affine_weighted[1:] += dataset.mass[p] * np.moveaxis(np.abs(velocity), -1, 0) * w
-        terms += w > 0
+        weighted += quantity[:, None, None, None] * weight(xi[p])
+        gradient += quantity[:, None, None, None] * slopes(weight, xi[p])
+        affine_weighted[1:] += np.moveaxis(np.abs(affine_term(xi[p])), -1, 0)
+        affine_gradient[1:] += np.moveaxis(slopes(affine_term, xi[p]), -1, 0)
+        terms += (np.abs(xi[p] - index) < SPLINES[spline].nodes / 2).all(axis=-1)
     np.testing.assert_allclose(pic.weighted, weighted, atol=1e-15)
-    np.testing.assert_allclose(pic.gradient, gradient, atol=1e-9)
-    np.testing.assert_array_equal(pic.terms, terms)
+    # Central differences fail at the linear spline's kink, where the first particle is; it has no momentum.
+    compared = slice(1 if spline == "linear" else 0, 4)
+    np.testing.assert_allclose(pic.gradient[compared], gradient[compared], atol=1e-9)
+    assert (pic.terms >= terms).all()
+    assert pic.terms.sum() == 30 * SPLINES[spline].nodes ** 3
     assert (pic.plain >= pic.weighted).all()
     assert (pic.plain[0] >= dataset.mass.min() * terms).all()
-    assert (apic.weighted[1:] >= affine_weighted[1:] * (1 - 1e-12)).all()
-    assert (apic.gradient >= pic.gradient).all()
-    constants = p2g(dataset, spline, "pic", "float32")
-    sums, eps, far = constants.sums, np.finfo(np.float32).eps, np.abs(xi).max()
-    expected = (C1 + C_ADD * terms) * sums.weighted + C2 * far * sums.gradient + C3 * far**2 * eps * sums.plain
-    np.testing.assert_allclose(allowance(constants), eps * expected, rtol=1e-6, atol=1e-30)
+    assert (apic.weighted >= affine_weighted * (1 - 1e-12)).all()
+    assert (apic.gradient >= affine_gradient - 1e-9).all()
+
+
+@pytest.mark.parametrize("spline", SPLINES)
+@pytest.mark.parametrize("spread", ["everywhere", "one node"])
+def test_sums_of_g2p_by_brute_force(spline, spread):
+    dataset, rule = on_a_node(), SPLINES[spline]
+    xi, dx = dataset.node_units(), dataset.grid.dx
+    field = np.random.default_rng(2).normal(size=(*dataset.grid.shape, 3))
+    if spread == "one node":
+        field[np.abs(np.stack(np.indices(dataset.grid.shape), axis=-1) - xi[0]).max(axis=-1) > 0] = 0
+    sums = g2p(dataset, field, spline, "apic", "float64").sums
+    index = np.stack(np.indices(dataset.grid.shape), axis=-1)
+    for p in range(1 if spline == "linear" else 0, 30):  # central differences fail at the linear spline's kink
+
+        def weight(x):
+            return textbook(spline, x - index).prod(axis=-1)
+
+        def factor(x, p=p):
+            if rule.affine_factor is not None:
+                return weight(x)[..., None] * (index - x) * rule.affine_factor / dx
+            w, slope = textbook(spline, x - index), np.sign(index - x) * (np.abs(index - x) < 1)
+            return np.stack([slope[..., a] * np.delete(w, a, axis=-1).prod(axis=-1) for a in range(3)], axis=-1) / dx
+
+        speed = np.abs(field)
+        np.testing.assert_allclose(sums.weighted[:3, p], np.einsum("ijk,ijkc", weight(xi[p]), speed), atol=1e-14)
+        np.testing.assert_allclose(sums.gradient[:3, p], np.einsum("ijk,ijkc", slopes(weight, xi[p]), speed), atol=1e-8)
+        size = np.einsum("ijka,ijkc->ca", np.abs(factor(xi[p])), speed).ravel()
+        slope = np.einsum("ijka,ijkc->ca", slopes(factor, xi[p]), speed).ravel()
+        assert (sums.weighted[3:, p] >= size * (1 - 1e-12)).all()
+        assert (sums.gradient[3:, p] >= slope - 1e-7).all()
+        assert (sums.plain[:3, p] >= sums.weighted[:3, p]).all()
+
+
+def test_allowance_is_the_sums_with_their_constants():
+    reference = p2g(on_a_node(), "cubic", "pic", "float32")
+    sums, eps, far = reference.sums, np.finfo(np.float32).eps, reference.max_xi
+    assert far == pytest.approx(np.abs(on_a_node().node_units()).max(), rel=1e-6)
+    expected = (C1 + C_ADD * sums.terms) * sums.weighted + C2 * far * sums.gradient + C3 * far**2 * eps * sums.plain
+    np.testing.assert_allclose(allowance(reference), eps * expected, rtol=1e-6, atol=1e-30)
 
 
 def test_constants_stay_small():
