@@ -252,7 +252,7 @@ def test_line_texts_follow_line_marks():
 def test_a_compiled_kernel_names_its_lines_as_the_source_does(tmp_path, monkeypatch):
     """Wherever it is compiled: a record must not depend on the working directory."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("MPMBENCH_CACHE_DIR", str(tmp_path))
     text = '#line 1 "header.cuh"\n__device__ int twice(int x) { return 2 * x; }\n#line 1 "k.cu"\n'
     text += 'extern "C" __global__ void k(int* a) {\n  a[threadIdx.x] = twice(a[threadIdx.x]);\n}\n'
     ptx = compile_cuda(text, "sm_52", ("-lineinfo",), name="k.cu")

@@ -577,7 +577,7 @@ def preprocessing(g: Group) -> Table:
             (
                 "per transfer",
                 lambda s: s.per_transfer,
-                "the transfer, with clearing the grid before P2G and dividing it before G2P",
+                "the transfer, and clearing or dividing the grid before it",
             ),
             ("total", lambda s: s.per_sort + s.per_transfer, "a sort and one transfer"),
         )
