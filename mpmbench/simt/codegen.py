@@ -470,13 +470,13 @@ class SegmentBody:
         number = len(g.sites)
         g.sites.append(site)
         bits = self.active_bits()
-        checker = g.job_field("check", pointer=True)
+        checker, data = g.job_field("check", pointer=True), g.job_field("check_data", pointer=True)
         absolute = f"{displacement}"
         if base != "null":
             absolute = w.value(f"add i64 {g.job_field('shared')}, {displacement}")
         passed = w.value(
-            f"call i32 {checker}(ptr %job, ptr %context, i64 {number}, i64 %lane.{self.number}, i32 {bits}, "
-            f"ptr {self.chunk_of(buffer)}, i64 {absolute})"
+            f"call i32 {checker}(ptr {data}, ptr %job, ptr %context, i64 {number}, i64 %lane.{self.number}, "
+            f"i32 {bits}, ptr {self.chunk_of(buffer)}, i64 {absolute})"
         )
         narrow = passed if w.lanes == 32 else w.value(f"trunc i32 {passed} to i{w.lanes}")
         mask = w.value(f"bitcast i{w.lanes} {narrow} to {w.vector('i1')}")

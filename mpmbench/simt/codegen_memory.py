@@ -283,7 +283,7 @@ def _load_quads(ctx: SegmentBody, index: int, access: Access, address: Address, 
         quads = []
         for tile in range(n // 4):
             pointer = _lane_address(ctx, ctx.chunk_of(buffer), 4 * tile + tile_lane, base, displacement)
-            quads.append(w.load(f"<4 x {element}>", pointer, 16))
+            quads.append(w.load(f"<4 x {element}>", pointer, 4))
         rows.append(_concatenate(ctx, quads, element))
     return w.transpose4(element, rows)
 
@@ -407,7 +407,7 @@ def _store_quads(
         vector = w.vector(element)
         quad = w.value(f"shufflevector {vector} {columns[tile_lane]}, {vector} poison, <4 x i32> <{mask}>")
         pointer = _lane_address(ctx, ctx.chunk_of(buffer), lane, base, displacement)
-        w.store(f"<4 x {element}>", quad, pointer, 16)
+        w.store(f"<4 x {element}>", quad, pointer, 4)
 
 
 def _store_small(ctx: SegmentBody, index: int, access: Access, address: Address, element: str, value: str) -> None:

@@ -213,10 +213,10 @@ class _Job:
         self.local = _aligned(max(1, 32 * self.warps * facts.local_bytes))
         self.counters = np.zeros(max(1, facts.counter_words), np.int64)
         self.order = np.zeros(max(1, self.warps), np.int64)
-        self._variables = [
+        self.variables = [
             module.variable(variable, size, bytes.fromhex(initial)) for variable, _, size, initial in facts.variables
         ]
-        self.variable_table = np.array([v.ctypes.data for v in self._variables] or [0], np.int64)
+        self.variable_table = np.array([v.ctypes.data for v in self.variables] or [0], np.int64)
         self._keep: list[Any] = []
         for axis, size in zip("xyz", grid, strict=True):
             self.set(f"grid_{axis}", size)

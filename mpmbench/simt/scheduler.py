@@ -24,8 +24,7 @@ JOB_FIELDS = (
     "params",  # address of the parameter block
     "local",  # address of the local memory of the thread block's threads
     "local_end",
-    "zeros",  # middle of a read-only area that dead lanes load from
-    "sink",  # middle of an area that dead lanes store to
+    "sink",  # middle of an area that dead lanes access instead
     "variables",  # address of a table of the module variables' addresses
     "budget",  # warp instructions that backward branches may still spend
     "counters",  # address of the counters
@@ -37,7 +36,6 @@ JOB_FIELDS = (
     "stop_warp",  # where a fault stopped the launch: warp in its block,
     "stop_segment",  # and segment of the kernel
     "order",  # scratch: ready warps (debug)
-    "poison",  # 1: fill shared memory with poison before each thread block
     "stranded",  # thread blocks in which some warps ended while others waited at a barrier (debug)
     "stranded_segment",
 )
@@ -327,7 +325,9 @@ wake.up:
   %wake.barrier = load i32, ptr %wake.barrier.field
   %wake.segment = zext i32 %wake.barrier to i64
   %stranded.segment.field = getelementptr i8, ptr %job, i64 @stranded_segment@
-  store i64 %wake.segment, ptr %stranded.segment.field
+  %wake.kept = load i64, ptr %stranded.segment.field
+  %wake.noted = select i1 %some.ended, i64 %wake.segment, i64 %wake.kept
+  store i64 %wake.noted, ptr %stranded.segment.field
   br label %wake.done
 
 wake.done:
