@@ -439,13 +439,19 @@ class SegmentBody:
             return
         self._check(site, buffer, displacement, base)
 
-    def observe_run(self, sites: list[Site], buffer: str, displacement: int, base: str) -> None:
-        """Count neighbouring accesses once all lanes have stored their addresses."""
+    def observe_run(
+        self, sites: list[Site], buffer: str, displacement: int, base: str, bits: str | None = None
+    ) -> None:
+        """Count neighbouring accesses once all lanes have stored their addresses.
+
+        bits: the chunk's active lanes, for accesses that were put off; else those of the instruction at hand.
+        """
+        bits = self.active_bits() if bits is None else bits
         first = len(self.g.sites)
         self.g.sites.extend(sites)
         mask_at = None
-        if self.active()[0] != f"%mask.{self.number}":
-            mask_at = self._kept_bits(self.active_bits())
+        if bits != f"%bits.{self.number}":
+            mask_at = self._kept_bits(bits)
 
         def after(warp_mask: str) -> None:
             mask = warp_mask
@@ -763,12 +769,18 @@ class _Segment:
         index = self.last.srcs[0]
         assert isinstance(index, Reg)
         targets = self.segment.successors[: len(self.last.targets)]
+        ways: dict[int, str] = {}  # lanes by where they go
         with codegen_warp.whole_warp(w):
             slot = w.load(w.vector("i32"), w.at("%context", g.slot[index]), 64)
             for position, target in enumerate(targets):
                 match = w.compare("icmp eq", "i32", slot, w.splat_int("i32", position))
-                bits = w.value(f"bitcast <32 x i1> {match} to i32")
-                self._add_pending(target, w.value(f"and i32 {bits}, {taken}"))
+                bits = w.value(f"and i32 {w.value(f'bitcast <32 x i1> {match} to i32')}, {taken}")
+                ways[target] = w.value(f"or i32 {ways[target]}, {bits}") if target in ways else bits
+        for target, bits in ways.items():
+            self._add_pending(target, bits)
+        if g.mode == "count":
+            stay = [w.value(f"xor i32 {taken}, {mask}")] if self.last.guard is not None else []
+            codegen_count.count_table_branch(g, n, [*ways.values(), *stay], mask)
         lowest = min((*targets, n + 1) if self.last.guard is not None else targets)
         if lowest <= n:
             self._spend(lowest)

@@ -64,6 +64,15 @@ def count_branch(g: _Generator, number: int, taken: str, stay: str) -> None:
     _add(g, SEGMENT_WORDS * number + 2, w.value(f"zext i1 {both} to i64"))
 
 
+def count_table_branch(g: _Generator, number: int, ways: Sequence[str], mask: str) -> None:
+    """The segment's branch by table sent these lanes to different places; divergent unless one got all of them."""
+    w = g.w
+    together = "false"
+    for lanes in ways:
+        together = w.value(f"or i1 {together}, {w.value(f'icmp eq i32 {lanes}, {mask}')}")
+    _add(g, SEGMENT_WORDS * number + 2, w.value(f"zext i1 {w.value(f'xor i1 {together}, true')} to i64"))
+
+
 def count_sites(
     g: _Generator, sites: Sequence[Site], first: int, buffer: str, displacement: int, base: str, mask: str
 ) -> None:

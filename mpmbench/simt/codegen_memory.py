@@ -581,7 +581,7 @@ def _count_run(ctx: SegmentBody, run: list[Deferred]) -> None:
         return
     first = run[0]
     sites = [Site(entry.index, "atomic", entry.access.space, entry.access.width, entry.access.width) for entry in run]
-    ctx.observe_run(sites, first.buffer, first.displacement, first.base)
+    ctx.observe_run(sites, first.buffer, first.displacement, first.base, first.mask)
 
 
 def _runs(entries: list[Deferred]) -> list[list[Deferred]]:

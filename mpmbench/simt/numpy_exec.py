@@ -34,7 +34,7 @@ from mpmbench.simt.ptx import (
 
 WARP = 32
 LANES = np.arange(WARP)
-UNKNOWN_LINE = SourceLine("unknown", 0)
+UNKNOWN_LINE = SourceLine("?", 0)
 
 _IGNORED_BY_MEMORY = frozenset({"volatile", "weak", "relaxed", "acquire", "release", "acq_rel", "seq_cst", "mmio"})
 _IGNORED_BY_MEMORY |= {"cta", "cluster", "gpu", "sys", "nc", "ca", "cg", "cs", "cv", "lu", "wb", "wt", "unified"}
@@ -370,8 +370,8 @@ def _check_members(warp: _Warp, launch: _Launch, step: _Step, active: Array) -> 
     here = _bits(active)
     if any(not int(named) >> lane & 1 for named, lane in zip(members, np.flatnonzero(active), strict=True)):
         launch.find("bad-mask", f"{step.item.opcode} run by a lane that its mask does not name", step.item)
-    elif any(int(named) & ~here for named in members):
-        launch.find("bad-mask", f"{step.item.opcode} names lanes that never arrive or have left", step.item)
+    elif any(int(named) & _bits(warp.live) & ~here for named in members):
+        launch.find("bad-mask", f"{step.item.opcode} names lanes that never arrive", step.item)
 
 
 def _release_barriers(block: _Block, launch: _Launch) -> None:

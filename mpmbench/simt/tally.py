@@ -51,7 +51,7 @@ def counters_from(facts: _Description, words: np.ndarray) -> Counters:
                 tally(last).bar_warp += executions
             else:
                 tally(last).bar += executions
-        elif root == "bra" and facts.guarded[last]:
+        elif root == "brx" or (root == "bra" and facts.guarded[last]):
             tally(last).branch += executions
             tally(last).div_branch += divergent
     at = SEGMENT_WORDS * len(facts.segments)
