@@ -367,6 +367,7 @@ def fake_cupy(gpu: FakeGpu) -> SimpleNamespace:
     return fake
 
 
+@functools.cache
 def compile_as_cupy_does(code: str, options: tuple[str, ...], capability: str) -> str:
     """PTX from CuPy's own binding of NVRTC, with the options that CuPy appends (cupy/cuda/compiler.py)."""
     program = cupy.cuda.compiler._NVRTCProgram(code, "fake.cu", method="ptx")
