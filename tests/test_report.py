@@ -32,7 +32,7 @@ ENVIRONMENT = Environment(
 )  # fmt: skip
 DATASET = DatasetSummary(
     "uniform_cube", {"particles_per_cell": 4}, 1, 1000, Grid((16, 16, 16), 0.1), "ab" * 32,
-    {"cells_occupied": 250, "mean_per_cell": 4.0, "histogram": [0, 1]},
+    {"cells_occupied": 250, "mean_per_cell": 4.0, "histogram": {"1": 0, "3-4": 250}},
 )  # fmt: skip
 GLOBAL_AXES = {"dtype": "float32", "spline": "cubic", "payload": "pic", "layout": "soa", "particle_order": "given"}
 BLOCK_AXES = {**GLOBAL_AXES, "particle_order": "deep", "block_shape": (8, 4, 4), "batching": 1}
@@ -352,6 +352,10 @@ def test_dataset_statistics_are_shown():
     assert table is not None
     assert column(table, "dataset") == ["uniform_cube (4 per cell)"]
     assert column(table, "cells occupied") == [250]
+    assert "histogram" not in [c.title for c in table.columns]
+    (histogram,) = tables.distributions(strategies())
+    assert column(histogram, "3-4") == [250]
+    assert histogram.title in markdown_text(strategies())
 
 
 # ---- Markdown ------------------------------------------------------------------------------------------------------
@@ -544,6 +548,8 @@ def test_unusual_records_still_make_a_report(record):
         (123456.7, Quantity.NUMBER, "123,457"),
         (2.5e-7, Quantity.NUMBER, "2.5e-07"),
         (999.7, Quantity.NUMBER, "1,000"),
+        (9.996, Quantity.NUMBER, "10.0"),
+        (0.9996, Quantity.NUMBER, "1.00"),
         (math.nan, Quantity.NUMBER, "nan"),
         (None, Quantity.NUMBER, "–"),
         (None, Quantity.TEXT, ""),

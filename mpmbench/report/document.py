@@ -117,7 +117,8 @@ def build(records: Sequence[Record], extent: Extent = EXTENTS[0]) -> Document:
         ("Kernels as compiled", tables.kernels(records)),
     ):
         if found:
-            sections.append(Section(title, (_untitled(found),)))
+            more = tables.distributions(records) if title.startswith("Datasets") else []
+            sections.append(Section(title, (_untitled(found), *more)))
     if extent.rows is not None:
         sections = [replace(s, tables=tuple(_shortened(t, extent.rows) for t in s.tables)) for s in sections]
     parts = {"hottest lines": extent.hottest, "single steps": extent.steps}

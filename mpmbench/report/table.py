@@ -27,6 +27,8 @@ PROBLEM_AXES = ("spline", "payload", "dtype")
 
 HOTTEST_LINES = 5
 
+DISTRIBUTION_TITLES = {"histogram": "Occupied cells by the number of particles in them"}
+
 
 class Kind(StrEnum):
     """Where a number comes from."""
@@ -511,6 +513,7 @@ def _rank(records: Sequence[Record], counter: Callable[[Tally], int]) -> Callabl
 # ---- tables of a group -------------------------------------------------------------------------------------
 
 WHY_RANKS_DISAGREE = (
+    "Ranks are of the transfer alone. "
     "The two ranks disagree where a strategy saves memory traffic by spending instructions (staging nodes in shared "
     "memory, waiting at barriers) or the reverse: which of them binds depends on the GPU, so neither rank is a time."
 )
@@ -728,22 +731,22 @@ def hottest_lines(record: Record, name: str, count: int = HOTTEST_LINES) -> Tabl
     n = particles(record) or 1
     columns = (
         Column("line", Kind.NAME, Quantity.CODE),
-        Column("source", Kind.NAME, Quantity.CODE),
         Column("warp inst / particle", Kind.SIMULATED, Quantity.NUMBER),
         Column("share of warp inst", Kind.SIMULATED, Quantity.SHARE, "more"),
         Column("sectors / particle", Kind.SIMULATED, Quantity.NUMBER),
         Column("share of sectors", Kind.SIMULATED, Quantity.SHARE, "more"),
+        Column("source", Kind.NAME, Quantity.CODE),  # last: it is as long as its author liked
     )
     rows = []
     for line in shown:
         tally = lines[line]
         values = (
             f"{line.file.rsplit('/', 1)[-1]}:{line.line}",
-            record.line_texts.get(line, ""),
             tally.warp_inst / n,
             tally.warp_inst / total.warp_inst if total.warp_inst else None,
             tally.sectors / n,
             tally.sectors / total.sectors if total.sectors else None,
+            record.line_texts.get(line, ""),
         )
         rows.append(Row(tuple(Cell(v, c.kind) for v, c in zip(values, columns, strict=True))))
     return Table(f"Hottest lines: {name}", columns, tuple(rows))
@@ -932,6 +935,24 @@ def datasets(records: Sequence[Record]) -> Table | None:
         for d in seen.values()
     ]
     return Table("Datasets: density and order", columns, tuple(rows))
+
+
+def distributions(records: Sequence[Record]) -> list[Table]:
+    """Statistics that are a count per class (particles per cell, say): a table each, a column per class."""
+    seen = {r.dataset.fingerprint: r.dataset for r in records}
+    names = dict.fromkeys(n for d in seen.values() for n, v in d.statistics.items() if isinstance(v, Mapping))
+    found = []
+    for name in names:
+        held = [(d, d.statistics[name]) for d in seen.values() if isinstance(d.statistics.get(name), Mapping)]
+        classes = list(dict.fromkeys(key for _, counts in held for key in counts))
+        columns = (
+            Column("dataset", Kind.NAME, Quantity.CODE),
+            *(Column(key, Kind.NAME, Quantity.COUNT) for key in classes),
+        )
+        rows = [_row([dataset_name(d), *(counts.get(key) for key in classes)], columns) for d, counts in held]
+        title = DISTRIBUTION_TITLES.get(name, name.replace("_", " "))
+        found.append(Table(title, columns, tuple(rows)))
+    return found
 
 
 # ---- published tables --------------------------------------------------------------------------------------

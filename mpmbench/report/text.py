@@ -43,18 +43,20 @@ def number(value: float) -> str:
     """Three significant digits, whole above 1000."""
     if isinstance(value, bool) or not math.isfinite(value):
         return str(value)
+    whole = float(value).is_integer()
+    value = float(f"{value:.3g}") if abs(value) < 1000 else value  # so that 9.996 is 10.0 and not 10.00
     size = abs(value)
     if size == 0:
         return "0"
     if size >= 1e9:
         return f"{value:.3g}"
-    if size >= 999.5:
+    if size >= 1000:
         return f"{value:,.0f}"
     if size < 1e-3:
         return f"{value:.1e}"
     decimals = 2 - math.floor(math.log10(size))
     text = f"{value:.{max(decimals, 0)}f}"
-    return text.rstrip("0").rstrip(".") if "." in text and float(value).is_integer() else text
+    return text.rstrip("0").rstrip(".") if "." in text and whole else text
 
 
 def scaled(value: float, base: int, units: tuple[str, ...]) -> str:
