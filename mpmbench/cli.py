@@ -372,6 +372,8 @@ def _run_cases(cases: list[Any], devices: list[Any], json_path: Path | None, exi
     kept: dict[Any, Any] = {}
     if json_path is not None and existing == "append" and json_path.exists():
         kept = {resume_key(record): record for record in read_records(json_path)}
+    for choice in dict.fromkeys(case.dataset for case in cases):
+        choice.load()  # bad input is refused before any file is touched and before an hour of work
     environment = Environment.capture()
     sampling = measure.QUICK if quick else None
     records: list[Any] = []
