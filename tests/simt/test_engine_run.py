@@ -46,8 +46,9 @@ def test_threads_past_the_end_of_a_partial_warp_do_nothing(width, rng):
     x, y = rng.normal(size=(2, 77)).astype(np.float32)
     want = np.float32(3) * x + y
     room = np.concatenate([y, np.full(200, -1, np.float32)])
-    run("(float a, const float* x, float* y) { int i = blockIdx.x * 11 + threadIdx.x; y[i] = __fmaf_rn(a, x[i], y[i]); }",
-        7, 11, np.float32(3), x, room, lane_width=width)  # fmt: skip
+    body = """(float a, const float* x, float* y) {
+        int i = blockIdx.x * 11 + threadIdx.x; y[i] = __fmaf_rn(a, x[i], y[i]); }"""
+    run(body, 7, 11, np.float32(3), x, room, lane_width=width)
     np.testing.assert_allclose(room[:77], want, rtol=1e-6)
     assert (room[77:] == -1).all()
 
@@ -315,8 +316,9 @@ def test_adds_to_neighbouring_words(width, space, real, rng):
 
 def test_an_add_is_seen_by_the_loads_that_follow_it():
     out = np.zeros(33, I32)
-    run("(int* o) { int t = threadIdx.x; atomicAdd(o + t, 5); int x = o[t]; atomicAdd(o + t + 1, 100); o[t] = x + o[t]; }",
-        1, 1, out)  # fmt: skip
+    body = """(int* o) { int t = threadIdx.x;
+        atomicAdd(o + t, 5); int x = o[t]; atomicAdd(o + t + 1, 100); o[t] = x + o[t]; }"""
+    run(body, 1, 1, out)
     assert out[:2].tolist() == [10, 100]
 
 
