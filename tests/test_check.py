@@ -239,9 +239,9 @@ def test_angular_momentum_counts_the_affine_part():
         assert total.drift > 10 * total.allowed
 
 
-def on_a_node() -> Dataset:
+def on_a_node(particles: int = 30) -> Dataset:
     """Random particles, the first one at rest on a node, where weights have no gradient but distances do."""
-    drawn = load_dataset("random", particles=30, grid_shape=(9, 7, 8), dx=0.5)
+    drawn = load_dataset("random", particles=particles, grid_shape=(9, 7, 8), dx=0.5)
     position, velocity = drawn.position.copy(), drawn.velocity.copy()
     position[0], velocity[0] = (2.0, 1.5, 1.5), 0
     return replace(drawn, position=position, velocity=velocity)
@@ -254,15 +254,16 @@ def slopes(term, xi: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("spline", SPLINES)
-def test_sums_of_p2g_by_brute_force(spline):
+@pytest.mark.parametrize("particles", [1, 30])
+def test_sums_of_p2g_by_brute_force(spline, particles):
     """Exact for PIC; the affine ones bound the exact sums."""
-    dataset = on_a_node()
+    dataset = on_a_node(particles)
     xi = dataset.node_units()
     pic, apic = (p2g(dataset, spline, payload, "float64").sums for payload in PAYLOADS)
     index = np.stack(np.indices(dataset.grid.shape), axis=-1)
     weighted, gradient, affine_weighted, affine_gradient = (np.zeros((4, *dataset.grid.shape)) for _ in range(4))
     terms = np.zeros(dataset.grid.shape)
-    for p in range(30):
+    for p in range(particles):
 
         def weight(x):
             return textbook(spline, x - index).prod(axis=-1)
@@ -282,7 +283,7 @@ def test_sums_of_p2g_by_brute_force(spline):
     compared = slice(1 if spline == "linear" else 0, 4)
     np.testing.assert_allclose(pic.gradient[compared], gradient[compared], atol=1e-9)
     assert (pic.terms >= terms).all()
-    assert pic.terms.sum() == 30 * SPLINES[spline].nodes ** 3
+    assert pic.terms.sum() == particles * SPLINES[spline].nodes ** 3
     assert (pic.plain >= pic.weighted).all()
     assert (pic.plain[0] >= dataset.mass.min() * terms).all()
     assert (apic.weighted >= affine_weighted * (1 - 1e-12)).all()
