@@ -134,9 +134,7 @@ class _Generator:
         w = self.w
         body, w.lines = w.lines, []
         entry = [line for _, lines in self.entry_values.values() for line in lines]
-        resumes = " ".join(
-            f"i32 {number}, label %run{number}" for number in self.resume_points() if number < len(self.segments)
-        )
+        resumes = " ".join(f"i32 {number}, label %{label}" for number, label in self.resume_points())
         count = len(self.segments)
         function = [
             "define i32 @warp(ptr noalias align 64 %context, ptr noalias %job) #0 {",
@@ -173,12 +171,15 @@ class _Generator:
             [(item.line.file, item.line.line) if item.line else None for item in self.kernel.instructions],
         )
 
-    def resume_points(self) -> list[int]:
+    def resume_points(self) -> list[tuple[int, str]]:
+        """Where a warp goes on that has returned: the next segment's number, and a label."""
         points = []
-        for number, segment in enumerate(self.segments):
+        for number, segment in enumerate(self.segments[:-1]):
             last = self.kernel.instructions[segment.stop - 1]
-            if codegen_warp.is_barrier(last) or (self.mode == "debug" and self.yields_after(last)):
-                points.append(number + 1)
+            if codegen_warp.is_reducing_barrier(last):
+                points.append((number + 1, f"reduced{number}"))
+            elif codegen_warp.is_barrier(last) or (self.mode == "debug" and self.yields_after(last)):
+                points.append((number + 1, f"run{number + 1}"))
         return points
 
     def yields_after(self, item: Instruction) -> bool:
@@ -807,12 +808,20 @@ class _Segment:
         self.fault(apart, scheduler.FAULT_DIVERGENT_BARRIER)
         if g.mode == "debug":
             w.store("i32", str(n), w.at("%context", scheduler.CONTEXT_BARRIER), 4)
-        if n + 1 < len(g.segments):
-            self._add_pending(n + 1, mask)
-            w.store("i32", str(n + 1), "%context", 4)
-            w.emit(f"ret i32 {scheduler.STATUS_BARRIER}")
-        else:
+        reduces = codegen_warp.is_reducing_barrier(self.last)
+        if reduces:
+            codegen_warp.arrive_with_vote(g, n, self.last, arrived)
+        if n + 1 >= len(g.segments):
             w.emit("br label %ended")
+            return
+        self._add_pending(n + 1, mask)
+        w.store("i32", str(n + 1), "%context", 4)
+        w.emit(f"ret i32 {scheduler.STATUS_BARRIER}")
+        if reduces:
+            w.label(f"reduced{n}")
+            waiting = w.load("i32", self._pending(n + 1), 4)
+            codegen_warp.read_votes(g, n, self.last, waiting)
+            w.emit(f"br label %run{n + 1}")
 
 
 def emit_fault(g: _Generator, condition: str, status: int, number: int) -> None:

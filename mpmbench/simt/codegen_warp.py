@@ -29,11 +29,50 @@ def is_collective(item: Instruction) -> bool:
     return item.root in _COLLECTIVES or is_warp_barrier(item)
 
 
+def is_reducing_barrier(item: Instruction) -> bool:
+    return is_barrier(item) and "red" in item.modifiers
+
+
 def check_barrier(item: Instruction) -> None:
-    """Only the barrier of the whole thread block is supported: ``bar.sync 0`` and its newer spellings."""
-    plain = set(item.modifiers) <= {"sync", "cta", "aligned"} and "sync" in item.modifiers
-    if not plain or len(item.srcs) != 1 or item.srcs[0] != Imm(0):
+    """Only the barrier of the whole thread block is supported: ``bar.sync 0``, ``bar.red``, newer spellings of both."""
+    kind = [modifier for modifier in item.modifiers if modifier not in ("cta", "aligned")]
+    sources = 2 if kind[:1] == ["red"] else 1
+    if kind not in (["sync"], ["red", "popc", "u32"], ["red", "and", "pred"], ["red", "or", "pred"]):
         raise Refused
+    if len(item.srcs) != sources or item.srcs[0] != Imm(0):
+        raise Refused
+
+
+def arrive_with_vote(g: _Generator, number: int, item: Instruction, warp_mask: str) -> None:
+    """Add the warp's lanes and its votes to the barrier's, and clear those of the next barrier."""
+    w = g.w
+    with whole_warp(w):
+        votes = _Collective(g, number, item, warp_mask).votes(item.srcs[1])
+        turn = w.load("i64", w.at("%context", scheduler.CONTEXT_REDUCTIONS), 8)
+        w.declare("declare i32 @llvm.ctpop.i32(i32)")
+        for field, bits in (("votes_0", votes), ("arrived_0", warp_mask)):
+            here, after = (_in_rotation(w, field, turn, step) for step in (0, 1))
+            count = w.value(f"zext i32 {w.value(f'call i32 @llvm.ctpop.i32(i32 {bits})')} to i64")
+            w.store("i64", w.value(f"add i64 {w.load('i64', here, 8)}, {count}"), here, 8)
+            w.store("i64", "0", after, 8)
+        more = w.value(f"add i64 {turn}, 1")
+        w.store("i64", more, w.at("%context", scheduler.CONTEXT_REDUCTIONS), 8)
+
+
+def read_votes(g: _Generator, number: int, item: Instruction, warp_mask: str) -> None:
+    """After the barrier: its outcome, the same for all threads."""
+    w = g.w
+    with whole_warp(w):
+        turn = w.load("i64", w.at("%context", scheduler.CONTEXT_REDUCTIONS), 8)
+        votes, arrived = (w.load("i64", _in_rotation(w, field, turn, -1), 8) for field in ("votes_0", "arrived_0"))
+        _Collective(g, number, item, warp_mask).write_outcome(votes, arrived)
+
+
+def _in_rotation(w: Writer, field: str, turn: str, step: int) -> str:
+    """Address of a field of the three sets of votes, counted from ``turn``."""
+    place = w.value(f"urem i64 {w.value(f'add i64 {turn}, {step + 3}')}, 3")
+    offset = w.value(f"mul i64 {place}, {scheduler.JOB['votes_1'] - scheduler.JOB['votes_0']}")
+    return w.value(f"getelementptr i8, ptr {w.at('%job', scheduler.JOB[field])}, i64 {offset}")
 
 
 @contextmanager
@@ -78,6 +117,20 @@ class _Collective:
         else:
             self._check_members(item.srcs[-1])
             {"shfl": self._shuffle, "vote": self._vote, "match": self._match, "redux": self._reduce}[item.root]()
+
+    def votes(self, operand: Operand) -> str:
+        """Lanes that hold a predicate, as bits."""
+        return self.w.value(f"and i32 {self._predicate_bits(operand)}, {self.mask}")
+
+    def write_outcome(self, votes: str, arrived: str) -> None:
+        """Result of a reducing barrier from its two counts."""
+        w = self.w
+        operation = next(m for m in self.item.modifiers if m in ("popc", "and", "or"))
+        if operation == "popc":
+            self._write(0, w.splat("i32", w.value(f"trunc i64 {votes} to i32")), "i32")
+            return
+        test = f"icmp eq i64 {votes}, {arrived}" if operation == "and" else f"icmp ne i64 {votes}, 0"
+        self._write_predicate(0, w.value(f"sext i1 {w.value(test)} to i32"))
 
     # --- operands ---
 

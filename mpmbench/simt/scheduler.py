@@ -38,6 +38,14 @@ JOB_FIELDS = (
     "order",  # scratch: ready warps (debug)
     "stranded",  # thread blocks in which some warps ended while others waited at a barrier (debug)
     "stranded_segment",
+    # Votes of reducing barriers (lanes that hold the predicate, lanes that arrived), three barriers in rotation: while
+    # one is read and the next is filled, the third is cleared.
+    "votes_0",
+    "arrived_0",
+    "votes_1",
+    "arrived_1",
+    "votes_2",
+    "arrived_2",
 )
 JOB = {name: 8 * position for position, name in enumerate(JOB_FIELDS)}
 JOB_BYTES = 8 * len(JOB_FIELDS)
@@ -50,6 +58,7 @@ CONTEXT_WARP = 12  # i32: number in the block
 CONTEXT_CTAID = 16  # 3 x i32
 CONTEXT_BARRIER = 28  # i32: segment of the barrier it waits at
 CONTEXT_WARP_EPOCH = 32  # i64: grows with every barrier that orders this warp's own lanes (debug)
+CONTEXT_REDUCTIONS = 40  # i64: reducing barriers that the warp has arrived at in this thread block
 CONTEXT_TID = 64  # 3 x 32 x i32
 CONTEXT_SLOTS = CONTEXT_TID + 3 * 128  # what the code generator lays out: pending masks, registers
 
@@ -112,6 +121,10 @@ entry:
 block.next:
   %b = phi i64 [ 0, %entry ], [ %b.after, %block.ended ]
   store i64 %b, ptr %block.field
+  %votes.field = getelementptr i8, ptr %job, i64 {JOB["votes_0"]}
+  %arrived.field = getelementptr i8, ptr %job, i64 {JOB["arrived_0"]}
+  store i64 0, ptr %votes.field
+  store i64 0, ptr %arrived.field
   %epoch.old = load i64, ptr %epoch.field
   %epoch.new = add i64 %epoch.old, 1
   store i64 %epoch.new, ptr %epoch.field
@@ -142,6 +155,8 @@ start:
   %tail.bit = shl i32 1, %tail.shift
   %tail.mask = sub i32 %tail.bit, 1
   %live = select i1 %is.full, i32 -1, i32 %tail.mask
+  %start.reductions = getelementptr i8, ptr %start.context, i64 {CONTEXT_REDUCTIONS}
+  store i64 0, ptr %start.reductions
   store i32 0, ptr %start.context
   store i32 %live, ptr %start.live
   store i32 {READY}, ptr %start.state

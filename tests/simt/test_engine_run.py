@@ -259,6 +259,23 @@ def test_block_reduction_with_barriers_and_shuffles(width, rng):
     np.testing.assert_array_equal(out, x.reshape(4, 256).sum(1))
 
 
+@pytest.mark.parametrize("mode", ["run", "debug"])
+def test_barriers_that_reduce(mode):
+    """Many in a row, so that fast warps meet the next one before slow ones have read the last."""
+    out = np.zeros((20, 160, 3), I32)
+    body = """(int* o) { int t = threadIdx.x;
+        #pragma unroll 1
+        for (int k = 0; k < 20; ++k) {
+            int n = __syncthreads_count(t % (k + 1) == 0), a = __syncthreads_and(t + 1 > k);
+            int s = __syncthreads_or(t == 8 * k);
+            int* p = o + 3 * (160 * k + t); p[0] = n; p[1] = a; p[2] = s; } }"""
+    assert run(body, 2, 160, out, mode=mode).findings == ()
+    t = np.arange(160)
+    for k in range(20):
+        want = [np.sum(t % (k + 1) == 0), k == 0, 8 * k < 160]
+        assert (out[k] == want).all()
+
+
 def test_warps_that_have_ended_do_not_hold_up_a_barrier():
     out = np.zeros(128, I32)
     run("(int* o) { if (threadIdx.x >= 64) return; __syncthreads(); o[threadIdx.x] = 1; }", 1, 128, out)
