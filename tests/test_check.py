@@ -287,7 +287,8 @@ def test_sums_of_p2g_by_brute_force(spline, particles):
     assert (pic.plain >= pic.weighted).all()
     assert (pic.plain[0] >= dataset.mass.min() * terms).all()
     assert (apic.weighted >= affine_weighted * (1 - 1e-12)).all()
-    assert (apic.gradient >= affine_gradient - 1e-9).all()
+    reached = pic.terms > 0  # the linear spline's cell is fixed, so a kink on its border is no way out
+    assert (apic.gradient >= affine_gradient - 1e-9)[:, reached].all()
 
 
 @pytest.mark.parametrize("spline", SPLINES)
