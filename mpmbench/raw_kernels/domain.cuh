@@ -20,6 +20,13 @@ __device__ inline int node_index(const Domain& domain, int x, int y, int z) {
     return (z * domain.ny + y) * domain.nx + x;
 }
 
+// The node at an offset of a support that starts at `lowest`. Its row comes first, so that x is a displacement inside the
+// instruction and a row of nodes shares one address.
+template <typename Node>
+__device__ inline Node* node_at(const Domain& domain, Node* lowest, const Offset& o) {
+    return lowest + node_index(domain, 0, o.y, o.z) + o.x;
+}
+
 __device__ inline bool in_grid(const Domain& domain, int x, int y, int z) {
     // One unsigned comparison per axis refuses negative indices as well.
     return unsigned(x) < unsigned(domain.nx) && unsigned(y) < unsigned(domain.ny) && unsigned(z) < unsigned(domain.nz);

@@ -22,6 +22,6 @@ extern "C" __global__ void p2g_global_atomic(
     for (int n = 0; n < SUPPORT; ++n) {
         const Offset o = support_offset(n);
         const real4 value = contribution(source, weights.scaled(source.mass, o), o);
-        atomic_add(lowest + node_index(domain, o.x, o.y, o.z), value);
+        atomic_add(node_at(domain, lowest, o), value);
     }
 }
