@@ -11,7 +11,7 @@ from markupsafe import Markup, escape
 
 from mpmbench.report.document import KINDS, Document
 from mpmbench.report.plots import Bars, Lines, svg
-from mpmbench.report.table import Kind, Quantity, Table
+from mpmbench.report.table import Column, Kind, Quantity, Table
 from mpmbench.report.text import LEFT, format_value
 
 
@@ -27,6 +27,7 @@ def render(document: Document) -> str:
     environment.globals |= {
         "header": _header,
         "rows": _rows,
+        "shown_columns": shown_columns,
         "kinds_by_name": {str(k): text for k, text in KINDS.items()},
     }
     return environment.get_template("report.html.j2").render(document=document, kinds=KINDS)
@@ -52,11 +53,16 @@ def _tight(title: str) -> str:
     return title.replace(" / ", " /\N{NO-BREAK SPACE}")
 
 
+def shown_columns(table: Table) -> list[Column]:
+    """Columns with a place of their own."""
+    return [column for column in table.columns if not column.under]
+
+
 def _header(table: Table) -> list[dict[str, Any]]:
     """The upper header row: which kind of number stands below, over how many columns."""
     return [
         {"kind": "" if kind is Kind.NAME else str(kind), "span": len(list(columns))}
-        for kind, columns in groupby(table.columns, key=lambda column: column.kind)
+        for kind, columns in groupby(shown_columns(table), key=lambda column: column.kind)
     ]
 
 
@@ -64,15 +70,21 @@ def _rows(table: Table) -> list[dict[str, Any]]:
     best = [table.best(i) for i in range(len(table.columns))]
     rows = []
     for i, row in enumerate(table.rows):
-        cells = [
-            {
-                "text": format_value(cell.value, column.quantity),
-                "prose": column.quantity is Quantity.PROSE,
-                "code": column.quantity is Quantity.CODE,
-                "left": column.quantity in LEFT,
-                "best": i in best[c],
-            }
-            for c, (cell, column) in enumerate(zip(row.cells, table.columns, strict=True))
-        ]
+        cells: list[dict[str, Any]] = []
+        for c, (cell, column) in enumerate(zip(row.cells, table.columns, strict=True)):
+            text = format_value(cell.value, column.quantity)
+            if column.under:
+                cells[-1]["under"] = text
+                continue
+            cells.append(
+                {
+                    "text": text,
+                    "under": "",
+                    "prose": column.quantity is Quantity.PROSE,
+                    "code": column.quantity is Quantity.CODE,
+                    "left": column.quantity in LEFT,
+                    "best": i in best[c],
+                }
+            )
         rows.append({"cells": cells, "status": row.status, "baseline": row.baseline})
     return rows

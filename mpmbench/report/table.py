@@ -68,13 +68,17 @@ class Cell:
 
 @dataclass(frozen=True)
 class Column:
-    """better: "less" or "more" where one end of the column is the good one, so that the best can be marked."""
+    """better: "less" or "more" where one end of the column is the good one, so that the best can be marked.
+
+    under: adds to the column before it, and may be shown beneath it where width is scarce.
+    """
 
     title: str
     kind: Kind
     quantity: Quantity = Quantity.NUMBER
     better: str | None = None
     explain: str = ""  # one line, for a legend
+    under: bool = False
 
 
 @dataclass(frozen=True)
@@ -405,7 +409,9 @@ def _break_even(measure: Measure, baseline: Record | None) -> Callable[[Record],
 
 _STRATEGY = _Source(Column("strategy", Kind.NAME, Quantity.CODE), lambda r: r.variant)
 _AXES = _Source(
-    Column("axes changed", Kind.NAME, Quantity.CODE, explain="axes that are not at the strategy's defaults"),
+    Column(
+        "axes changed", Kind.NAME, Quantity.CODE, explain="axes that are not at the strategy's defaults", under=True
+    ),
     lambda r: axes_text(changed_axes(r)),
 )
 _REMARK = _Source(Column("remark", Kind.NAME, Quantity.PROSE), reason)
