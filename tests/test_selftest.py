@@ -92,6 +92,7 @@ def test_a_gpu_that_adds_wrongly_is_found_out_and_not_timed(gpu: FakeGpu) -> Non
     wrong = rows.pop("p2g_global_atomic")
     assert not wrong.passed
     assert wrong.seconds is None
+    assert "worst error" in wrong.problem
     assert "differs from the simulated device" in wrong.problem
     assert str(wrong).startswith("FAILED p2g_global_atomic one_cell: ")
     assert all(row.passed for row in rows.values())
