@@ -86,7 +86,9 @@ def list_datasets() -> list[Recipe]:
 
 def list_devices() -> list[DeviceSummary]:
     """The simulated device and, where there is one, each GPU; else one line that says why there is none."""
-    devices = [DeviceSummary("simulated", "runs the CUDA kernels on this CPU: results, counters, findings; no times", True)]
+    devices = [
+        DeviceSummary("simulated", "runs the CUDA kernels on this CPU: results, counters, findings; no times", True)
+    ]
     try:
         open_device("cuda")
     except MpmbenchError as error:

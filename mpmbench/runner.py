@@ -106,7 +106,9 @@ class Inputs:
 
     def particles(self, axes: Mapping[str, Any]) -> ReferenceParticles:
         """The reference G2P for these axes, from ``rounded_nodes``."""
-        return self._cached("g2p", axes, lambda dataset, *how: g2p(dataset, grid_divide(self.rounded_nodes(axes)), *how))
+        return self._cached(
+            "g2p", axes, lambda dataset, *how: g2p(dataset, grid_divide(self.rounded_nodes(axes)), *how)
+        )
 
     def _cached(self, transfer: str, axes: Mapping[str, Any], make: Callable[..., Any]) -> Any:
         assert self.dataset is not None
@@ -141,7 +143,9 @@ def run_case(
     free = free_bytes(device)
     if about["device_bytes_predicted"] > free:
         need = about["device_bytes_predicted"]
-        return Record(**about, skipped_because=f"needs {need / 2**30:.2f} GiB, {device.name} has {free / 2**30:.2f} free")
+        return Record(
+            **about, skipped_because=f"needs {need / 2**30:.2f} GiB, {device.name} has {free / 2**30:.2f} free"
+        )
     begin = time.perf_counter()
     try:
         return _run(case, device, inputs, about, sampling, begin)
