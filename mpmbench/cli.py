@@ -212,7 +212,7 @@ def list_command(variant_dirs: Sequence[Path], as_json: bool) -> None:
             table.add_row(name, summary)
         console.print(table)
         console.print()
-    table = RichTable("axis", "values, the default first", "other default", title="Axes", title_justify="left", box=None,
+    table = RichTable("axis", "values, usual default first", "other default", title="Axes", title_justify="left", box=None,
                       padding=(0, 2, 0, 0))  # fmt: skip
     for name in dict.fromkeys(name for v in variants for name in v.axes):
         defaults = {v.name: resolve_axes(v, {})[name] for v in variants if name in v.axes}

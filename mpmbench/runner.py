@@ -17,7 +17,7 @@ import numpy as np
 from mpmbench import plan as planning
 from mpmbench.check import CheckResult, check_g2p, check_p2g
 from mpmbench.dataset import Dataset, load_dataset
-from mpmbench.device import Device, run_all
+from mpmbench.device import Device
 from mpmbench.environment import Environment
 from mpmbench.errors import InputError
 from mpmbench.measure import Sampling, measure_plan

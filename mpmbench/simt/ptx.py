@@ -451,8 +451,8 @@ class _Parser:
         parts = _split_commas(rest)
         if root in {"bra", "brx"}:
             targets = tuple(parts[-1:]) if root == "bra" else (parts[1],)
-            srcs = (register(parts[0]),) if root == "brx" else ()
-            return Instruction(opcode, (), srcs, guard, negated, targets, line)
+            index = (register(parts[0]),) if root == "brx" else ()
+            return Instruction(opcode, (), index, guard, negated, targets, line)
         if root == "call":
             return self._call(opcode, parts, guard, negated, line)
 
@@ -483,7 +483,7 @@ class _Parser:
             head, parts = parts[0], parts[1:]
             names = _split_commas(head[1:-1]) if head.startswith("{") else head.split("|")
             dsts = tuple(None if name == "_" else register(name) for name in names)
-        srcs = tuple(map(operand, parts))
+        srcs: tuple[Operand, ...] = tuple(map(operand, parts))
         if root in {"addc", "subc", "madc"}:
             srcs = (*srcs, CARRY)
         if "cc" in modifiers:
