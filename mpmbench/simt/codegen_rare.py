@@ -215,7 +215,8 @@ def _find_nth_set(ctx: Lanes, item: Instruction) -> None:
     at_base = w.compare("icmp eq", "i32", offset, zero)
     step = w.select("i32", down, none, one)
     left = w.intrinsic("llvm.umax", "i32", w.select("i32", down, w.binary("sub", "i32", zero, offset), offset), one)
-    position, result = base, none
+    # A walk that leaves the word has ended, even where the bit number wraps around.
+    walks, position, result = w.compare("icmp ult", "i32", base, w.splat_int("i32", 32)), base, none
     for distance in range(32):
         inside = w.compare("icmp ult", "i32", position, w.splat_int("i32", 32))
         shift = w.intrinsic("llvm.umin", "i32", position, w.splat_int("i32", 31))
@@ -225,6 +226,7 @@ def _find_nth_set(ctx: Lanes, item: Instruction) -> None:
         left = w.binary("sub", "i32", left, bit)
         found = w.compare("icmp eq", "i32", left, zero)
         found = w.binary("and", "i1", found, w.compare("icmp ne", "i32", before, zero))
+        found = w.binary("and", "i1", found, walks)
         if distance:  # a plain look at the base goes no further
             found = w.binary("and", "i1", found, w.invert(at_base))
         result = w.select("i32", found, position, result)
