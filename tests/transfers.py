@@ -18,6 +18,7 @@ from mpmbench.variants import Variant, resolve_axes
 SEED = 1905
 
 
+@lru_cache(maxsize=8)  # one object per dataset: references are remembered by identity
 def crowded(n: int = 240, shape: tuple[int, int, int] = (13, 10, 11)) -> Dataset:
     """Odd-sized grid; a third of the particles anywhere, the rest crowded into a few cells on block borders."""
     rng = np.random.default_rng(SEED)
@@ -27,6 +28,7 @@ def crowded(n: int = 240, shape: tuple[int, int, int] = (13, 10, 11)) -> Dataset
     return _dataset(np.concatenate([anywhere, crowd])[rng.permutation(n)], shape, rng)
 
 
+@lru_cache(maxsize=8)
 def filled(per_cell: int, cells: tuple[int, int, int] = (8, 4, 4)) -> Dataset:
     """Exactly ``per_cell`` particles in each cell of one box of cells, whatever the spline: it starts on a block."""
     rng = np.random.default_rng(SEED)
