@@ -76,6 +76,9 @@ def _selection(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--particles", type=click.IntRange(min=0), help="Particles of recipe datasets."),
         click.option("--particles-per-cell", "--ppc", type=click.IntRange(min=1), help="Density where it is exact."),
         click.option("--seed", type=click.IntRange(min=0), help="Seed of recipe datasets."),
+        click.option("--grid-shape", metavar="NXxNYxNZ", help="Nodes per axis; a .npy file carries no grid."),
+        click.option("--dx", type=float, help="Node spacing [m]."),
+        click.option("--origin", type=(float, float, float), metavar="X Y Z", help="Position of node (0, 0, 0) [m]."),
         click.option("-d", "--device", "devices", multiple=True, metavar="DEVICE",
                      help="simulated, cuda, cuda:N. Default: simulated, and cuda where there is a GPU."),
         click.option("--arch", default=None, metavar="sm_XX", help="Architecture the simulated device compiles for."),
@@ -95,6 +98,9 @@ def _choose(
     particles: int | None,
     particles_per_cell: int | None,
     seed: int | None,
+    grid_shape: str | None,
+    dx: float | None,
+    origin: tuple[float, float, float] | None,
     variant_dirs: Sequence[Path],
     quick: bool,
     preset_name: str | None = None,
@@ -103,6 +109,7 @@ def _choose(
     from dataclasses import replace
 
     from mpmbench import presets
+    from mpmbench.dataset import list_datasets
     from mpmbench.runner import DatasetChoice, cases_of
     from mpmbench.variants import discover
 
@@ -126,15 +133,32 @@ def _choose(
     variants = discover(variant_dirs)
     chosen = _match(variants, patterns) if patterns else variants
     size = particles if particles is not None else QUICK_PARTICLES if quick else None
-    choices = []
-    for name in datasets or ("uniform_cube",):
-        is_file = Path(name).suffix in {".npz", ".npy"}
-        from_recipe = not is_file and name != "splash"
-        choices.append(DatasetChoice(name, size if from_recipe else particles, particles_per_cell, seed))
+    sizable = {recipe.name for recipe in list_datasets() if "particles" in recipe.parameters}
+    choices = [
+        DatasetChoice(
+            name,
+            size if name in sizable else particles,
+            particles_per_cell,
+            seed,
+            _parse_shape(grid_shape),
+            dx,
+            origin,
+        )
+        for name in datasets or ("uniform_cube",)
+    ]
     return cases_of(chosen, choices, dict(map(_parse_axis, axes)))
 
 
 QUICK_PARTICLES = 20_000
+
+
+def _parse_shape(text: str | None) -> tuple[int, int, int] | None:
+    from mpmbench.presets import parse_value
+
+    shape = parse_value(text) if text is not None else None
+    if shape is not None and not isinstance(shape, tuple):
+        raise InputError(f"cannot read grid shape {text!r}: write it as three whole numbers, such as 128x128x128")
+    return shape
 
 
 def _match(variants: Iterable[Any], patterns: Sequence[str]) -> list[Any]:

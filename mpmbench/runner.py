@@ -34,9 +34,20 @@ class DatasetChoice:
     particles: int | None = None
     particles_per_cell: int | None = None
     seed: int | None = None
+    grid_shape: tuple[int, int, int] | None = None
+    dx: float | None = None
+    origin: tuple[float, float, float] | None = None
 
     def load(self) -> Dataset:
-        return load_dataset(self.name, self.particles, self.particles_per_cell, self.seed)
+        return load_dataset(
+            self.name,
+            self.particles,
+            self.particles_per_cell,
+            self.seed,
+            grid_shape=self.grid_shape,
+            dx=self.dx,
+            origin=self.origin,
+        )
 
 
 @dataclass(frozen=True)

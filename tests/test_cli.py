@@ -81,6 +81,14 @@ def test_own_particles(tmp_path):
     assert {r.dataset.n for r in read_records(tmp_path / "rows.jsonl")} == {60}
 
 
+def test_npy_needs_a_grid(tmp_path):
+    path = tmp_path / "mine.npy"
+    np.save(path, np.random.default_rng(3).uniform(0.2, 0.6, (50, 7)))
+    assert "grid" in refusal("run", "--dataset", path, "-d", "simulated")
+    assert "three whole numbers" in refusal("run", "--dataset", path, "--grid-shape", "16", "-d", "simulated")
+    invoke("run", "--dataset", path, "--grid-shape", "16x16x16", "--dx", 1 / 16, "-b", "g2p_*", "-d", "simulated")
+
+
 def test_dry_run_runs_nothing(tmp_path):
     out = invoke("run", "--preset", "thesis", "-d", "simulated", "--dry-run", "--json", tmp_path / "rows.jsonl")
     assert "32 rows" in out
