@@ -58,7 +58,7 @@ class _Generator:
         self.kernel, self.variables, self.mode = kernel, variables, mode
         self.w = Writer(lanes)
         self.lanes = lanes
-        self.segments = basic_blocks(kernel, self._ends_segment)
+        self.segments = basic_blocks(kernel, self._ends_segment, codegen_warp.gathers)
         self.forms = AddressForms(kernel.instructions)
         self.sites: list[Site] = []
         self.entry_values: dict[str, tuple[str, list[str]]] = {}
@@ -84,8 +84,10 @@ class _Generator:
     def _joinable(self) -> set[int]:
         """Segments at which lanes may wait for others."""
         result: set[int] = set()
-        for segment in self.segments:
+        for number, segment in enumerate(self.segments):
             last = self.kernel.instructions[segment.stop - 1]
+            if codegen_warp.gathers(last):
+                result.add(number)
             if last.root in _BRANCHES:
                 result.update(segment.successors)
         return result
@@ -150,8 +152,7 @@ class _Generator:
             "store i32 %start.live, ptr %start.pending, align 4",
             "br label %run0" if count else "br label %ended",
             *body,
-            "ended:",
-            f"ret i32 {scheduler.STATUS_ENDED}",
+            *self._end(),
             "}",
             'attributes #0 = { nounwind "prefer-vector-width"="512" "min-legal-vector-width"="512" }',
         ]
@@ -170,6 +171,40 @@ class _Generator:
             min(widths, default=4),
             [(item.line.file, item.line.line) if item.line else None for item in self.kernel.instructions],
         )
+
+    def _end(self) -> list[str]:
+        """The kernel's last code. Lanes that wait for others look once more, since lanes may have left meanwhile."""
+        if not any(codegen_warp.gathers(item) for item in self.kernel.instructions):
+            return ["ended:", f"ret i32 {scheduler.STATUS_ENDED}"]
+
+        def field(name: str, offset: int) -> list[str]:
+            return [
+                f"%{name}.at = getelementptr i8, ptr %context, i64 {offset}",
+                f"%{name} = load i32, ptr %{name}.at, align 4",
+            ]
+
+        return [
+            "ended:",
+            *field("end.live", scheduler.CONTEXT_LIVE),
+            "%end.none = icmp eq i32 %end.live, 0",
+            "br i1 %end.none, label %end.all, label %end.waiting",
+            "end.all:",
+            f"ret i32 {scheduler.STATUS_ENDED}",
+            "end.waiting:",
+            *field("end.again", scheduler.CONTEXT_AGAIN),
+            "%end.first = icmp eq i32 %end.again, 0",
+            "br i1 %end.first, label %end.retry, label %end.stuck",
+            "end.retry:",
+            "store i32 1, ptr %end.again.at, align 4",
+            f"br label %{self.chain(0)}",
+            "end.stuck:",
+            *field("end.status", scheduler.CONTEXT_STUCK),
+            *field("end.segment", scheduler.CONTEXT_STUCK_SEGMENT),
+            "%end.segment.wide = zext i32 %end.segment to i64",
+            f"%end.stop = getelementptr i8, ptr %job, i64 {JOB['stop_segment']}",
+            "store i64 %end.segment.wide, ptr %end.stop, align 8",
+            "ret i32 %end.status",
+        ]
 
     def resume_points(self) -> list[tuple[int, str]]:
         """Where a warp goes on that has returned: the next segment's number, and a label."""
@@ -587,7 +622,7 @@ class _Segment:
         w.label(f"run{n}")
         w.emit(f"%warp.{n} = load i32, ptr {self._pending(n)}, align 4")
         w.store("i32", "0", self._pending(n), 4)
-        if g.mode == "count":
+        if g.mode == "count" and not codegen_warp.gathers(self.last):
             codegen_count.count_segment(g, n, f"%warp.{n}")
         body = SegmentBody(g, n, self.segment)
         is_tail = self._is_tail()
@@ -655,7 +690,7 @@ class _Segment:
             return
         if codegen_warp.is_collective(last):
             try:
-                codegen_warp.emit_collective(g, n, last, mask)
+                codegen_warp.emit_collective(g, n, last, mask, self._gather)
             except (Refused, KeyError, ValueError, IndexError) as problem:
                 raise refusal(last) from problem
             self._fall_through(mask)
@@ -676,6 +711,32 @@ class _Segment:
             w.emit(f"ret i32 {scheduler.STATUS_YIELD}")
         else:
             self._fall_through(mask)
+
+    def _gather(self, named: str, arrived: str, status: int) -> None:
+        """Let the lanes wait at this segment while live lanes that they name are still on their way.
+
+        named, arrived: lanes as bits. status: how the launch ends if one of those never comes, or leaves meanwhile.
+        """
+        w, n, g = self.w, self.number, self.g
+        live = self._live()
+        waited_at = w.at("%context", scheduler.CONTEXT_WAITED)
+        waited = w.load("i32", waited_at, 4)
+        elsewhere = w.value(f"and i32 {named}, {w.value(f'xor i32 {arrived}, -1')}")
+        missing = w.value(f"and i32 {elsewhere}, {live}")
+        w.emit(f"br i1 {w.value(f'icmp ne i32 {missing}, 0')}, label %wait{n}, label %gathered{n}")
+        w.label(f"wait{n}")
+        self._add_pending(n, f"%warp.{n}")
+        w.store("i32", str(status), w.at("%context", scheduler.CONTEXT_STUCK), 4)
+        w.store("i32", str(n), w.at("%context", scheduler.CONTEXT_STUCK_SEGMENT), 4)
+        w.store("i32", w.value(f"or i32 {waited}, {missing}"), waited_at, 4)
+        w.emit(f"br label %{g.chain(n + 1)}")
+        w.label(f"gathered{n}")
+        w.store("i32", "0", w.at("%context", scheduler.CONTEXT_AGAIN), 4)
+        left = w.value(f"and i32 {elsewhere}, {waited}")  # dead, or they would be missing
+        w.store("i32", w.value(f"and i32 {waited}, {w.value(f'xor i32 {arrived}, -1')}"), waited_at, 4)
+        self.fault(w.value(f"icmp ne i32 {left}, 0"), status)
+        if g.mode == "count":
+            codegen_count.count_segment(g, n, f"%warp.{n}")
 
     def fault(self, condition: str, status: int) -> None:
         """Stop the launch with ``status`` if the condition holds; go on otherwise."""
@@ -804,8 +865,7 @@ class _Segment:
         except Refused as problem:
             raise refusal(self.last) from problem
         arrived = self._guard_bits(mask)
-        apart = w.value(f"icmp ne i32 {arrived}, {self._live()}")
-        self.fault(apart, scheduler.FAULT_DIVERGENT_BARRIER)
+        self._gather("-1", arrived, scheduler.FAULT_DIVERGENT_BARRIER)
         if g.mode == "debug":
             w.store("i32", str(n), w.at("%context", scheduler.CONTEXT_BARRIER), 4)
         reduces = codegen_warp.is_reducing_barrier(self.last)

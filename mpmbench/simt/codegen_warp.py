@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -27,6 +27,11 @@ def is_warp_barrier(item: Instruction) -> bool:
 
 def is_collective(item: Instruction) -> bool:
     return item.root in _COLLECTIVES or is_warp_barrier(item)
+
+
+def gathers(item: Instruction) -> bool:
+    """Whether the instruction waits for other lanes of its warp."""
+    return is_barrier(item) or (is_collective(item) and item.root != "activemask")
 
 
 def is_reducing_barrier(item: Instruction) -> bool:
@@ -85,10 +90,13 @@ def whole_warp(w: Writer) -> Iterator[None]:
         w.lanes = lanes
 
 
-def emit_collective(g: _Generator, number: int, item: Instruction, warp_mask: str) -> None:
-    """mask: lanes that execute the instruction together."""
+def emit_collective(
+    g: _Generator, number: int, item: Instruction, warp_mask: str, gather: Callable[[str, str, int], None]
+) -> None:
+    """mask: lanes that execute the instruction together. gather: (lanes named, lanes here, fault if one never
+    comes) writes the code that waits for them."""
     with whole_warp(g.w):
-        _Collective(g, number, item, warp_mask).emit()
+        _Collective(g, number, item, warp_mask).emit(gather)
 
 
 class _Collective:
@@ -102,12 +110,12 @@ class _Collective:
             self.mask = self.w.value(f"and i32 {guard}, {warp_mask}")
         self.mask_vector = self.w.value(f"bitcast i32 {self.mask} to <32 x i1>")
 
-    def emit(self) -> None:
+    def emit(self, gather: Callable[[str, str, int], None]) -> None:
         item = self.item
         if item.root == "activemask":
             self._write(0, self.w.splat("i32", self.mask), "i32")
         elif is_warp_barrier(item):
-            self._check_members(item.srcs[0])
+            self._check_members(item.srcs[0], gather)
             if self.g.mode == "debug":
                 address = self.w.at("%context", scheduler.CONTEXT_WARP_EPOCH)
                 old = self.w.load("i64", address, 8)
@@ -115,7 +123,7 @@ class _Collective:
         elif "sync" not in item.modifiers:
             raise Refused
         else:
-            self._check_members(item.srcs[-1])
+            self._check_members(item.srcs[-1], gather)
             {"shfl": self._shuffle, "vote": self._vote, "match": self._match, "redux": self._reduce}[item.root]()
 
     def votes(self, operand: Operand) -> str:
@@ -168,29 +176,25 @@ class _Collective:
         changed = w.value(f"and i32 {w.value(f'xor i32 {old}, {bits}')}, {self.mask}")
         w.store("i32", w.value(f"xor i32 {old}, {changed}"), address, 4)
 
-    def _check_members(self, operand: Operand) -> None:
-        """Every live lane that the member mask names must be here, and every lane here must be named."""
+    def _check_members(self, operand: Operand, gather: Callable[[str, str, int], None]) -> None:
+        """Wait for every live lane that the member mask names; every lane here must be named."""
         from mpmbench.simt.codegen import emit_fault
 
         w = self.w
-        live = w.load("i32", w.at("%context", scheduler.CONTEXT_LIVE), 4)
         if isinstance(operand, Imm):
             named = str(operand.value & 0xFFFFFFFF)
-            missing = w.value(f"and i32 {w.value(f'and i32 {named}, {live}')}, {w.value(f'xor i32 {self.mask}, -1')}")
             unnamed = w.value(f"and i32 {self.mask}, {w.value(f'xor i32 {named}, -1')}")
-            wrong = w.value(f"or i32 {missing}, {unnamed}")
         else:
-            # A register may name another group in every lane: each lane's group must be here and contain the lane.
+            # A register may name another group in every lane; each lane must be in its own group.
             members = self._read(operand, "b32")
-            absent = w.splat("i32", w.value(f"and i32 {live}, {w.value(f'xor i32 {self.mask}, -1')}"))
-            missing_lanes = w.binary("and", "i32", members, absent)
-            own = w.binary("shl", "i32", w.splat_int("i32", 1), _lane_constant())
-            is_missing = w.compare("icmp ne", "i32", missing_lanes, w.splat_int("i32", 0))
-            is_unnamed = w.compare("icmp eq", "i32", w.binary("and", "i32", members, own), w.splat_int("i32", 0))
-            bits = w.value(f"bitcast <32 x i1> {w.binary('or', 'i1', is_missing, is_unnamed)} to i32")
-            wrong = w.value(f"and i32 {bits}, {self.mask}")
-        some = w.value(f"icmp ne i32 {wrong}, 0")
-        emit_fault(self.g, some, scheduler.FAULT_MASK, self.number)
+            executing = w.select("i32", self.mask_vector, members, w.splat_int("i32", 0))
+            w.declare("declare i32 @llvm.vector.reduce.or.v32i32(<32 x i32>)")
+            named = w.value(f"call i32 @llvm.vector.reduce.or.v32i32(<32 x i32> {executing})")
+            own = w.binary("and", "i32", members, w.binary("shl", "i32", w.splat_int("i32", 1), _lane_constant()))
+            is_unnamed = w.compare("icmp eq", "i32", own, w.splat_int("i32", 0))
+            unnamed = w.value(f"and i32 {w.value(f'bitcast <32 x i1> {is_unnamed} to i32')}, {self.mask}")
+        gather(named, self.mask, scheduler.FAULT_MASK)
+        emit_fault(self.g, w.value(f"icmp ne i32 {unnamed}, 0"), scheduler.FAULT_MASK, self.number)
 
     # --- operations ---
 

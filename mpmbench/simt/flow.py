@@ -27,11 +27,15 @@ class Block:
     live_out: frozenset[Reg]
 
 
-def basic_blocks(kernel: Kernel, ends_block: Callable[[Instruction], bool] = lambda _: False) -> list[Block]:
+def basic_blocks(
+    kernel: Kernel,
+    ends_block: Callable[[Instruction], bool] = lambda _: False,
+    starts_block: Callable[[Instruction], bool] = lambda _: False,
+) -> list[Block]:
     """Split a kernel into basic blocks, in text order.
 
     ends_block: further instructions that must be the last of their block (barriers, warp-level operations, or every
-    shared access where an executor wants to switch warps there).
+    shared access where an executor wants to switch warps there). starts_block: those that must be the first of theirs.
     """
     instructions = kernel.instructions
     count = len(instructions)
@@ -39,6 +43,8 @@ def basic_blocks(kernel: Kernel, ends_block: Callable[[Instruction], bool] = lam
     for index, item in enumerate(instructions):
         if (item.root in ENDS_BLOCK or ends_block(item)) and index + 1 < count:
             starts.add(index + 1)
+        if starts_block(item):
+            starts.add(index)
     borders = [*sorted(starts), count]
     number = {start: block for block, start in enumerate(borders)}
     spans = list(pairwise(borders))

@@ -102,6 +102,7 @@ class _Warp:
     local_start: Array  # address of each lane's local memory
     splits: dict[int, Array] = field(default_factory=dict)  # program counter -> lanes waiting there
     parked: set[int] = field(default_factory=set)  # those that wait for other lanes at a warp-level operation
+    waited: int = 0  # mask of lanes that others have waited for and that have not come yet
     barrier: _Arrival | None = None
 
 
@@ -307,9 +308,11 @@ def _run_split(warp: _Warp, launch: _Launch, pc: int, mask: Array, forced: bool)
                 raise _Stopped
             pc += 1
             continue
-        if (mask != warp.live).any():
+        if (mask != warp.live).any() or warp.waited & ~_bits(mask):
+            # Some never come, or left while others waited here.
             launch.find("divergent-barrier", "a barrier reached by only some lanes of a warp", step.item)
             raise _Stopped
+        warp.waited = 0
         step.tally.bar += 1
         arrival = step.apply(warp, active)
         assert isinstance(arrival, _Arrival)
@@ -346,15 +349,17 @@ def _bits(lanes: Array) -> int:
 
 
 def _must_wait(warp: _Warp, step: _Step, mask: Array, active: Array) -> bool:
-    """Whether lanes that the operation names are alive but not here yet. ``bar.sync`` is defined only for whole
-    warps, so it does not wait: it is a finding. ``barrier.sync`` without ``.aligned`` collects the lanes."""
+    """Whether lanes that the operation names are alive but not here yet."""
+    missing = _named(warp, step, active) & _bits(warp.live) & ~_bits(mask if step.kind == "barrier" else active)
+    warp.waited |= missing
+    return missing != 0
+
+
+def _named(warp: _Warp, step: _Step, active: Array) -> int:
+    """All lanes that the executing lanes name, as a mask; a block barrier names everyone."""
     if step.kind == "barrier":
-        aligned = step.item.root == "bar" or "aligned" in step.item.modifiers
-        return not aligned and bool((mask != warp.live).any())
-    named = 0
-    for members in np.unique(_members(warp, step, active)[active]):
-        named |= int(members)
-    return bool(named & _bits(warp.live) & ~_bits(mask))
+        return 0xFFFFFFFF
+    return int(np.bitwise_or.reduce(_members(warp, step, active)[active], initial=0))
 
 
 def _members(warp: _Warp, step: _Step, active: Array) -> Array:
@@ -366,12 +371,13 @@ def _members(warp: _Warp, step: _Step, active: Array) -> Array:
 
 
 def _check_members(warp: _Warp, launch: _Launch, step: _Step, active: Array) -> None:
-    members = _members(warp, step, active)[active]
-    here = _bits(active)
-    if any(not int(named) >> lane & 1 for named, lane in zip(members, np.flatnonzero(active), strict=True)):
+    here, named = _bits(active), _named(warp, step, active)
+    members = _members(warp, step, active)
+    if any(not int(members[lane]) >> lane & 1 for lane in np.flatnonzero(active).tolist()):
         launch.find("bad-mask", f"{step.item.opcode} run by a lane that its mask does not name", step.item)
-    elif any(int(named) & _bits(warp.live) & ~here for named in members):
+    elif named & ~here & (_bits(warp.live) | warp.waited):
         launch.find("bad-mask", f"{step.item.opcode} names lanes that never arrive", step.item)
+    warp.waited &= ~here
 
 
 def _release_barriers(block: _Block, launch: _Launch) -> None:
