@@ -73,8 +73,5 @@ def test_unbroken_origin_passes(mutant: dict, modes) -> None:
     assert not findings
 
 
-def test_there_is_a_mutant_for_every_kernel_file() -> None:
-    """Each source file has been broken at least once; what is not counted here only counts or clears integers."""
-    untouched = {path.name for path in kernel.RAW_KERNELS.iterdir()} - {m["file"] for m in MUTANTS.values()}
-    assert untouched == {"scan.cuh", "scan_add.cu", "clear_counts.cu", "bin_particles.cu", "sort_index.cu",
-                         "p2g_global_node.cu", "g2p_global_gather.cu"}  # fmt: skip
+def test_every_kernel_file_has_been_broken() -> None:
+    assert {mutant["file"] for mutant in MUTANTS.values()} == {path.name for path in kernel.RAW_KERNELS.iterdir()}
