@@ -236,8 +236,8 @@ def list_command(variant_dirs: Sequence[Path], as_json: bool) -> None:
             table.add_row(name, summary)
         console.print(table)
         console.print()
-    table = RichTable("axis", "values, usual default first", "other default", title="Axes", title_justify="left", box=None,
-                      padding=(0, 2, 0, 0))  # fmt: skip
+    heads = ("axis", "values, usual default first", "other default")
+    table = RichTable(*heads, title="Axes", title_justify="left", box=None, padding=(0, 2, 0, 0))
     for name in dict.fromkeys(name for v in variants for name in v.axes):
         defaults = {v.name: resolve_axes(v, {})[name] for v in variants if name in v.axes}
         usual = Counter(map(format_axis, defaults.values())).most_common(1)[0][0]

@@ -216,4 +216,4 @@ def test_interrupted_run_keeps_finished_rows(tmp_path, how):
     invoke(*words, "--json", rows, "--resume")
     records = read_records(rows)
     assert len(records) == 6
-    assert len({tuple(sorted(map(str, r.axes.items()))) + (r.variant,) for r in records}) == 6
+    assert len({(r.variant, *sorted(map(str, r.axes.items()))) for r in records}) == 6

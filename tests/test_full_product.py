@@ -1,0 +1,44 @@
+"""Every combination of every axis of every strategy, against the reference: hours of work for ``make test-all``.
+
+What has passed is noted in the cache folder under the hash of its kernel, so a run that was stopped goes on where it
+was, and a changed kernel is run again.
+"""
+
+from __future__ import annotations
+
+import itertools
+import random
+
+import pytest
+from transfers import crowded, transfer
+
+from mpmbench.device import open_device
+from mpmbench.kernel import load_source
+from mpmbench.simt import cache
+from mpmbench.variants import discover, why_impossible
+from mpmbench.workspace import kernel_constants
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", discover(), ids=lambda variant: variant.name)
+def test_every_combination(variant) -> None:
+    journal = cache.cache_folder() / f"passed-{variant.name}.txt"
+    journal.parent.mkdir(parents=True, exist_ok=True)
+    passed = set(journal.read_text().split("\n")) if journal.exists() else set()
+    rows = [dict(zip(variant.axes, values, strict=True)) for values in itertools.product(*variant.axes.values())]
+    rows = [axes for axes in rows if why_impossible(variant, axes) is None]
+    random.Random(1).shuffle(rows)  # a run that is stopped early has seen a bit of everything
+    device = open_device("simulated", arch="sm_52", mode="run")
+    dataset = crowded()
+    with pytest.MonkeyPatch.context() as patch, journal.open("a") as notes:
+        patch.setattr(cache, "store", lambda *_: None)  # tens of thousands of kernels would fill the disk
+        for axes in rows:
+            source = load_source(variant.kernel_path, kernel_constants(axes))
+            key = cache.content_key(source.text, repr(sorted(axes.items())))
+            if key in passed:
+                continue
+            check, _, findings = transfer(variant, dataset, device, **axes)
+            assert check.passed, f"{axes}: {check}"
+            assert not findings
+            notes.write(key + "\n")
+            notes.flush()
