@@ -29,12 +29,14 @@ def published_rows(table: int) -> list[dict[str, str]]:
 def thesis() -> list[Case]:
     """Every row of tables 11-16 at full size, dataset by dataset so that each is loaded once."""
     variants = {v.name: v for v in discover()}
-    cases = [_thesis_case(row, variants) for table in THESIS_TABLES for row in published_rows(table)]
+    cases = [
+        _thesis_case(place, row, variants) for table in THESIS_TABLES for place, row in enumerate(published_rows(table))
+    ]
     # Stable: within a dataset the rows keep the order of the tables.
     return sorted(cases, key=lambda case: (case.dataset.name, case.dataset.particles_per_cell or 0))
 
 
-def _thesis_case(row: dict[str, str], variants: dict[str, Variant]) -> Case:
+def _thesis_case(place: int, row: dict[str, str], variants: dict[str, Variant]) -> Case:
     variant = variants[row["variant"]]
     given: dict[str, Any] = {"dtype": "float32", "spline": "cubic", "payload": "pic", "layout": "soa"}
     for name in _AXIS_COLUMNS:
@@ -51,6 +53,7 @@ def _thesis_case(row: dict[str, str], variants: dict[str, Variant]) -> Case:
         "source": "thesis",
         "table": int(printed.pop("table")),
         "row": printed.pop("row"),
+        "place": place,  # of the row in its table; cases run dataset by dataset
         "published_us": float(printed.pop("time_us")),
         "published_speedup": float(printed["speedup"]) if printed.get("speedup") else None,
         "erratum": printed.pop("erratum") or None,

@@ -172,7 +172,9 @@ class Record:
     host_seconds: float | None = None  # wall clock that the run itself took here; never a GPU time
     skipped_because: str | None = None  # cannot exist or does not fit: not run
     failed_because: str | None = None  # was run and broke: compiler refusal, launch error, ...
-    preset_row: Mapping[str, Any] | None = None  # table, row, published_us, published_speedup, erratum, ...
+    preset_row: Mapping[str, Any] | None = (
+        None  # source, table, row, place, published_us, published_speedup, erratum, ...
+    )
 
     def __post_init__(self) -> None:
         timed = [s for s in self.steps.values() if s.measurement] or self.transfer_measurement

@@ -318,6 +318,14 @@ def test_published_numbers_stand_beside_ours_in_columns_of_their_own():
     assert all(word in markdown_text(records) for word in ("254,410", "12,801", "19.87", "61.3"))
 
 
+def test_published_rows_come_in_the_order_printed():
+    def run(table: int, place: int) -> Record:
+        return simulated(preset_row={"table": table, "row": f"{table}.{place}", "place": place}, sectors=table + place)
+
+    found = tables.presets([run(12, 0), run(9, 1), run(12, 2), run(9, 0), run(12, 1)])
+    assert [column(t, "row as printed") for t in found] == [["9.0", "9.1"], ["12.0", "12.1", "12.2"]]
+
+
 def test_a_second_row_without_a_speedup_is_a_second_baseline():
     """Table 15 of the thesis prints two families of rows, each against its own first row."""
     speedups = (None, 1.1, None, 1.2)

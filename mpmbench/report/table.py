@@ -966,8 +966,15 @@ def distributions(records: Sequence[Record]) -> list[Table]:
 
 def presets(records: Sequence[Record]) -> list[Table]:
     """One table per published table: its printed numbers beside ours, in columns of their own."""
-    numbers = dict.fromkeys(_preset(r, "table") for r in records if r.preset_row)
-    return [_published([r for r in records if r.preset_row and _preset(r, "table") == n]) for n in numbers]
+    found: dict[tuple[str, Any, str], list[Record]] = {}
+    for r in records:
+        if r.preset_row:
+            found.setdefault((str(_preset(r, "source")), _preset(r, "table"), r.device), []).append(r)
+    # Records come in the order run; tables and rows are wanted in the order printed.
+    return [
+        _published(sorted(rows, key=lambda r: _preset(r, "place") or 0))
+        for _, rows in sorted(found.items(), key=lambda item: (item[0][0], f"{item[0][1]!s:>9}", item[0][2]))
+    ]
 
 
 def _preset(record: Record, key: str) -> Any:
