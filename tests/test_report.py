@@ -447,7 +447,9 @@ def test_html_needs_nothing_but_itself():
 def test_html_says_what_markdown_says():
     """Every table of the document, cell by cell."""
     records = [*strategies(), *bad_runs()]
-    shown = "".join(Page(html_text(records)).text)
+    text = html_text(records)
+    assert "<small> batching=4</small>" in text  # the column that HTML shows beneath the strategy
+    shown = "".join(Page(text).text)
     for table in all_tables(document.build(records)):
         for row in table.rows:
             for cell, col in zip(row.cells, table.columns, strict=True):
