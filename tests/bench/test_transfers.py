@@ -2,9 +2,9 @@
 
     pytest tests/bench --benchmark-enable -o addopts=""
 
-On a GPU the figures are event times: the timer is a clock that only events advance, so ``pedantic`` is the one mode that
-works (auto-calibration would wait for a clock that stands still). Without a GPU the figure is the wall clock of the
-simulated device on this CPU, in a group of its own that says so; what the kernel costs is in ``extra_info``.
+On a GPU the figures are event times: the timer is a clock that only events advance, so ``pedantic`` is the one mode
+that works (auto-calibration would wait for a clock that stands still). Without a GPU the figure is the wall clock of
+the simulated device on this CPU, in a group of its own that says so; what the kernel costs is in ``extra_info``.
 """
 
 from __future__ import annotations
@@ -54,10 +54,9 @@ def device_clock():
 @pytest.mark.gpu
 @pytest.mark.parametrize("choice", DATASETS, ids=lambda choice: choice.name)
 @pytest.mark.parametrize("variant", discover(), ids=lambda variant: variant.name)
-@pytest.mark.benchmark(group="cuda: event time")
 def test_cuda(request, device_clock, variant, choice):
     # The clock must be the benchmark's timer before the fixture is built, so the fixture is asked for here.
-    request.node.add_marker(pytest.mark.benchmark(timer=device_clock))
+    request.node.add_marker(pytest.mark.benchmark(timer=device_clock, group="cuda: event time"))
     benchmark = request.getfixturevalue("benchmark")
     inputs = Inputs()
     case = Case(variant, choice, resolve_axes(variant, {}))
