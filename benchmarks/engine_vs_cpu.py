@@ -82,6 +82,7 @@ class Result:
     particles: int
     seconds: dict[str, list[float]] = field(default_factory=dict)
     ratios: dict[str, Interval] = field(default_factory=dict)  # engine over peer
+    processor_ratios: dict[str, Interval] = field(default_factory=dict)  # the same in time on the core
     noise: Interval | None = None  # a peer over itself
     floor_seconds: float = 0.0  # compulsory bytes at this machine's copy rate
     disturbed: int = 0
@@ -128,7 +129,7 @@ class Bench:
         again = next((arm for arm in arms if arm.name in self.peers), None)
         if again is not None:  # the same code twice: how far apart can equals be here?
             arms.append(Arm("again", again.run, again.reset))
-        sampled = rounds.run_rounds(arms, self.rounds[deep], self.seed) if arms else rounds.Rounds({})
+        sampled = rounds.run_rounds(arms, self.rounds[deep], self.seed) if arms else rounds.Rounds({}, {})
         return [self._result(row, scene, sampled, excluded, again) for row in rows]
 
     def _result(
@@ -141,7 +142,8 @@ class Bench:
         result.seconds = {name: seconds[name].tolist() for name in names}
         if row.variant in seconds:
             result.seconds["engine"] = seconds[row.variant].tolist()
-            result.ratios = {name: rounds.paired_ratio(seconds[row.variant], seconds[name]) for name in names}
+            result.ratios = _ratios(seconds, row.variant, names)
+            result.processor_ratios = _ratios(sampled.processor_seconds, row.variant, names)
         if again is not None:
             result.noise = rounds.paired_ratio(seconds["again"], seconds[again.name])
         variant = next(v for v in discover() if v.name == row.variant)
@@ -218,6 +220,10 @@ class Bench:
         return self._references[key]
 
 
+def _ratios(seconds: Mapping[str, np.ndarray], over: str, names: list[str]) -> dict[str, Interval]:
+    return {name: rounds.paired_ratio(seconds[over], seconds[name]) for name in names}
+
+
 def _axes(row: Row) -> dict[str, Any]:
     return AXES | {"particle_order": "deep" if row.deep else "given"}
 
@@ -264,6 +270,16 @@ def times_table(results: list[Result]) -> list[str]:
     return lines
 
 
+def processor_table(results: list[Result]) -> list[str]:
+    """Ratios of time on the core: what is left of a measurement on a machine that was never calm."""
+    names = [peer.name for peer in PEERS]
+    lines = [f"| case | {' | '.join(f'engine / {name}' for name in names)} |", "|---" * (len(names) + 1) + "|"]
+    for result in results:
+        cells = [str(result.processor_ratios.get(name, "-")) for name in names]
+        lines.append(f"| {result.row.label} | {' | '.join(cells)} |")
+    return lines
+
+
 def ratio_table(results: list[Result]) -> list[str]:
     """Engine over peer, the aim and whether it is met."""
     names = [peer.name for peer in PEERS]
@@ -305,6 +321,8 @@ def markdown(results: list[Result], bench: Bench, about: Mapping[str, Any]) -> s
         *ratio_table(results),
         "",
     ]
+    if any(result.kept_disturbed for result in results):
+        lines += ["## The same in processor time: disturbed rounds had to be kept", "", *processor_table(results), ""]
     lines += [f"- {note}" for note in notes(results, about)]
     return "\n".join(lines).rstrip() + "\n"
 
@@ -334,6 +352,7 @@ def as_json(results: list[Result], bench: Bench, about: Mapping[str, Any]) -> di
                 "particles": result.particles,
                 "visit_ns": {name: result.visit_ns(name) for name in result.seconds},
                 "ratio_engine_over": {name: asdict(ratio) for name, ratio in result.ratios.items()},
+                "processor_time_ratio": {name: asdict(ratio) for name, ratio in result.processor_ratios.items()},
                 "same_code_twice": asdict(result.noise) if result.noise else None,
                 "verdict": result.verdict,
                 "floor_seconds": result.floor_seconds,

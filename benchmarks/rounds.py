@@ -29,10 +29,11 @@ class Arm:
 
 @dataclass(frozen=True, eq=False)
 class Rounds:
-    """seconds: by arm, (rounds,). disturbed: rounds run again because another process took the core; kept_disturbed:
-    such rounds that were kept because too many had been run again."""
+    """seconds, processor_seconds: wall clock and time on the core, by arm, (rounds,). disturbed: rounds run again
+    because another process took the core; kept_disturbed: such rounds kept because too many had been run again."""
 
     seconds: dict[str, np.ndarray] = field(repr=False)
+    processor_seconds: dict[str, np.ndarray] = field(repr=False)
     disturbed: int = 0
     kept_disturbed: int = 0
 
@@ -66,17 +67,17 @@ def run_rounds(arms: Sequence[Arm], rounds: int, seed: int) -> Rounds:
     for arm in arms:
         arm.reset()
         arm.run()
-    kept: list[list[float]] = []
+    kept: list[list[tuple[float, float]]] = []
     disturbed = kept_disturbed = 0
     while len(kept) < rounds:
-        sample = [0.0] * len(arms)
+        sample = [(0.0, 0.0)] * len(arms)
         calm = True
         for a in random.permutation(len(arms)):
             arms[a].reset()
             wall, processor = time.perf_counter(), time.process_time()
             arms[a].run()
             wall, processor = time.perf_counter() - wall, time.process_time() - processor
-            sample[a] = wall
+            sample[a] = wall, processor
             calm &= wall - processor <= DISTURBED_SHARE * wall + DISTURBED_SECONDS
         if not calm:
             if disturbed < rounds:
@@ -84,8 +85,14 @@ def run_rounds(arms: Sequence[Arm], rounds: int, seed: int) -> Rounds:
                 continue
             kept_disturbed += 1
         kept.append(sample)
-    columns = np.array(kept).T
-    return Rounds({arm.name: column for arm, column in zip(arms, columns, strict=True)}, disturbed, kept_disturbed)
+    by_arm = np.array(kept).transpose(1, 2, 0)
+    names = [arm.name for arm in arms]
+    return Rounds(
+        {name: times[0] for name, times in zip(names, by_arm, strict=True)},
+        {name: times[1] for name, times in zip(names, by_arm, strict=True)},
+        disturbed,
+        kept_disturbed,
+    )
 
 
 def paired_ratio(over: np.ndarray, under: np.ndarray, seed: int = 0, resamples: int = 4000) -> Interval:

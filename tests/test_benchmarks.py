@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -64,20 +63,50 @@ def test_interval_of_the_median_holds_the_truth():
     assert held >= 85
 
 
-def test_every_round_runs_every_arm_once_after_its_reset_in_seeded_random_order():
+class Clock:
+    """Time that passes only where an arm says so: on the core, or while another process has it."""
+
+    def __init__(self):
+        self.wall = self.core = 0.0
+
+    def work(self, seconds):
+        self.wall += seconds
+        self.core += seconds
+
+    def perf_counter(self):
+        return self.wall
+
+    def process_time(self):
+        return self.core
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    import rounds
+
+    clock = Clock()
+    monkeypatch.setattr(rounds, "time", clock)
+    return clock
+
+
+def test_every_round_runs_every_arm_once_after_its_reset_in_seeded_random_order(clock):
     from rounds import Arm, run_rounds
 
     def orders(seed):
         log = []
-        arms = [
-            Arm(name, run=lambda n=name: log.append(n), reset=lambda n=name: log.append(f"reset {n}")) for name in "abc"
-        ]
+
+        def run(name):
+            log.append(name)
+            clock.work("abc".index(name) + 1)
+
+        arms = [Arm(n, run=lambda n=n: run(n), reset=lambda n=n: log.append(f"reset {n}")) for n in "abc"]
         sampled = run_rounds(arms, rounds=8, seed=seed)
-        assert all(len(seconds) == 8 for seconds in sampled.seconds.values())
+        assert {name: set(seconds) for name, seconds in sampled.seconds.items()} == {"a": {1}, "b": {2}, "c": {3}}
         assert log[0::2] == [f"reset {name}" for name in log[1::2]]
         names = log[1::2]
         assert names[:3] == ["a", "b", "c"]  # untimed
         chunks = ["".join(names[i : i + 3]) for i in range(3, len(names), 3)]
+        assert len(chunks) == 8
         assert all(sorted(chunk) == ["a", "b", "c"] for chunk in chunks)
         return chunks
 
@@ -85,27 +114,32 @@ def test_every_round_runs_every_arm_once_after_its_reset_in_seeded_random_order(
     assert orders(1) == orders(1) != orders(2)
 
 
-def test_a_round_that_lost_the_core_is_run_again():
+def test_a_round_that_lost_the_core_is_run_again(clock):
     from rounds import Arm, run_rounds
 
-    slept = []
+    runs = []
 
     def lose_the_core_once():
-        if len(slept) == 1:  # the first timed run; number 0 is the untimed one
-            time.sleep(0.02)
-        slept.append(1)
+        runs.append(1)
+        clock.work(1)
+        clock.wall += 0.5 * (len(runs) == 3)  # the second timed run; the first of all is untimed
 
     sampled = run_rounds([Arm("a", lose_the_core_once, lambda: None)], rounds=3, seed=0)
-    assert sampled.disturbed >= 1
-    assert len(sampled.seconds["a"]) == 3
-    assert sampled.seconds["a"].max() < 0.02
+    assert (sampled.disturbed, sampled.kept_disturbed, len(runs)) == (1, 0, 5)
+    assert sampled.seconds["a"].tolist() == sampled.processor_seconds["a"].tolist() == [1, 1, 1]
 
 
-def test_rounds_end_on_a_machine_that_is_never_calm():
+def test_rounds_end_on_a_machine_that_is_never_calm(clock):
     from rounds import Arm, run_rounds
 
-    sampled = run_rounds([Arm("a", lambda: time.sleep(0.005), lambda: None)], rounds=2, seed=0)
+    def shared():
+        clock.work(1)
+        clock.wall += 1
+
+    sampled = run_rounds([Arm("a", shared, lambda: None)], rounds=2, seed=0)
     assert (sampled.disturbed, sampled.kept_disturbed) == (2, 2)
+    assert sampled.seconds["a"].tolist() == [2, 2]
+    assert sampled.processor_seconds["a"].tolist() == [1, 1]
 
 
 # --- peers ----------------------------------------------------------------------------------------------------------
