@@ -615,7 +615,7 @@ class _Decoder:
         def apply(warp: _Warp, active: Array | None) -> None:
             lanes = np.ones(WARP, dtype=bool) if active is None else active
             pieces = warp.block.launch.memory.locate(address(warp), lanes, size, space)
-            memory.count_load(tally(warp), pieces, size)
+            memory.count_load(tally(warp), pieces, size, is_generic=not space)
             values = memory.load(pieces, dtype, count)
             for position, write in enumerate(writers):
                 write(warp, active, np.ascontiguousarray(values[:, position]))

@@ -137,8 +137,9 @@ def atomic(pieces: list[Piece], dtype: np.dtype, count: int, change: Callable[[A
 # --- counting ---------------------------------------------------------------------------------------------------------
 
 
-def count_load(tally: Tally, pieces: list[Piece], size: int) -> None:
-    for space, at, lanes in _by_space(pieces):
+def count_load(tally: Tally, pieces: list[Piece], size: int, is_generic: bool) -> None:
+    """Constant memory has a path of its own, but not by generic addresses."""
+    for space, at, lanes in _by_space(pieces, is_generic):
         if space == "global":
             tally.gld_req += 1
             tally.gld_sectors += _sectors(at)
@@ -176,10 +177,13 @@ def count_atomic(tally: Tally, pieces: list[Piece]) -> None:
             tally.satom_iter += int(times.max())
 
 
-def _by_space(pieces: list[Piece]) -> Iterable[tuple[str, Array, Array]]:
+def _by_space(pieces: list[Piece], const_is_global: bool = False) -> Iterable[tuple[str, Array, Array]]:
     """-> space, byte positions, lane numbers. Positions are addresses (global) or offsets from a bank-0 byte."""
-    for space in sorted({piece.space for piece in pieces}):
-        mine = [piece for piece in pieces if piece.space == space]
+    sorted_by: dict[str, list[Piece]] = {}
+    for piece in pieces:
+        space = "global" if const_is_global and piece.space == "const" else piece.space
+        sorted_by.setdefault(space, []).append(piece)
+    for space, mine in sorted(sorted_by.items()):
         bases = [piece.data.ctypes.data if space == "global" else 0 for piece in mine]
         at = np.concatenate([piece.offsets + base for piece, base in zip(mine, bases, strict=True)])
         yield space, at, np.concatenate([piece.lanes for piece in mine])
