@@ -105,6 +105,11 @@ class DatasetSummary:
             statistics=dict(_plain(dataset.statistics) or {}),
         )
 
+    @classmethod
+    def of_array(cls, name: str, size: int, seed: int, fingerprint: str) -> DatasetSummary:
+        """Summarise the input of a primitive: its grid is a row of ``size`` places."""
+        return cls(name, {"size": size}, seed, size, Grid((size, 1, 1), 1.0), fingerprint)
+
 
 @dataclass(frozen=True)
 class Check:
@@ -148,7 +153,7 @@ class Record:
     """One strategy, on one dataset, with one choice of axes, on one device."""
 
     variant: str
-    transfer: str  # "p2g" | "g2p"
+    transfer: str  # "p2g" | "g2p", or the operation of a primitive: "reduce", "scan", ...
     dataset: DatasetSummary
     axes: Mapping[str, Any]
     device: str  # "simulated", "cuda:0"
@@ -207,6 +212,11 @@ class Record:
         if self.findings:
             return "findings"
         return "ok" if self.check is not None else "unchecked"
+
+    @property
+    def is_transfer(self) -> bool:
+        """False for a primitive."""
+        return self.transfer in ("p2g", "g2p")
 
     @property
     def simulated(self) -> bool:

@@ -17,12 +17,13 @@ import numpy as np
 from mpmbench import plan as planning
 from mpmbench.check import CheckResult, check_g2p, check_p2g
 from mpmbench.dataset import Dataset, load_dataset
-from mpmbench.device import Device
+from mpmbench.device import Device, Launch
 from mpmbench.environment import Environment
 from mpmbench.errors import InputError
 from mpmbench.measure import Sampling, measure_plan
 from mpmbench.record import Check, DatasetSummary, Record, StepCost, line_texts
 from mpmbench.reference import Nodes, ReferenceNodes, ReferenceParticles, g2p, grid_divide, p2g
+from mpmbench.simt.counters import Counters
 from mpmbench.variants import Variant, resolve_axes, why_impossible
 
 
@@ -174,16 +175,11 @@ def _run(
     plan = planning.build_plan(variant, dataset, device, axes, nodes=nodes)
     preprocess, transfer, finish = plan.run_once(device)
     check = check_outputs(plan.outputs(), variant.transfer, inputs, axes)
-    kernels = {launch.kernel.entry: launch.kernel for launch in plan.transfer.launches}
-    about["hashes"] = {entry: kernel.source.sha256 for entry, kernel in kernels.items()}
-    about["kernel_info"] = {entry: asdict(device.info(kernel)) for entry, kernel in kernels.items()}
+    about |= kernel_facts(device, plan.transfer.launches, transfer.counters)
     findings = [f for report in (*preprocess.values(), transfer, *finish.values()) for f in report.findings]
     about |= {"check": Check.of(check), "findings": tuple(findings)}
     if device.name == "simulated":
         if transfer.counters is not None:
-            about["transfer_counters"] = transfer.counters
-            text = "\n".join(kernel.source.text for kernel in kernels.values())
-            about["line_texts"] = line_texts(text, transfer.counters.lines)
             about["preprocess"] = {name: StepCost(counters=report.counters) for name, report in preprocess.items()}
             about["finish"] = {name: StepCost(counters=report.counters) for name, report in finish.items()}
     elif check.passed:
@@ -192,6 +188,19 @@ def _run(
         about["preprocess"] = {name: StepCost(measurement=m) for name, m in times.preprocess.items()}
         about["finish"] = {name: StepCost(measurement=m) for name, m in times.finish.items()}
     return Record(**about, host_seconds=time.perf_counter() - begin)
+
+
+def kernel_facts(device: Device, launches: Sequence[Launch], counters: Counters | None) -> dict[str, Any]:
+    """What a record says of the kernels that ran, and what was counted in them with the text of those lines."""
+    kernels = {launch.kernel.entry: launch.kernel for launch in launches}
+    facts: dict[str, Any] = {
+        "hashes": {entry: kernel.source.sha256 for entry, kernel in kernels.items()},
+        "kernel_info": {entry: asdict(device.info(kernel)) for entry, kernel in kernels.items()},
+    }
+    if counters is not None:
+        text = "\n".join(kernel.source.text for kernel in kernels.values())
+        facts |= {"transfer_counters": counters, "line_texts": line_texts(text, counters.lines)}
+    return facts
 
 
 def check_outputs(outputs: Any, transfer: str, inputs: Inputs, axes: Mapping[str, Any]) -> CheckResult:

@@ -12,12 +12,10 @@ import numpy as np
 from mpmbench.device import CompiledKernel, Device, Launch
 from mpmbench.errors import InputError, MpmbenchError
 from mpmbench.grid import Grid
-from mpmbench.kernel import load_source
+from mpmbench.launcher import INT32_LIMIT, THREADS, Launcher
 from mpmbench.variants import ATTRIBUTES, AXES, RESULTS, Variant
 
 SCAN_SEGMENT = 1024  # values that one thread block of scan_segments.cu scans
-THREADS = 128  # per thread block, where a kernel leaves the choice open
-INT32_LIMIT = 2**31  # kernels index with 32-bit integers
 
 BufferTable = dict[str, tuple[tuple[int, ...], np.dtype]]
 
@@ -131,7 +129,7 @@ def _scan_table(prefix: str, count: int) -> BufferTable:
 
 
 @dataclass
-class Workspace:
+class Workspace(Launcher):
     """One variant, its axes and its buffers on one device: what ``Variant.launch`` builds launches from."""
 
     variant: Variant
@@ -141,7 +139,7 @@ class Workspace:
     device: Device
     buffers: dict[str, Any] = field(default_factory=dict, repr=False)  # given ones are kept, the others allocated
     active_count: int | None = None  # blocks in the active list; read back once it is made
-    _kernels: dict[Any, CompiledKernel] = field(default_factory=dict, repr=False)
+    kernels: dict[Any, CompiledKernel] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         self.constants = kernel_constants(self.axes)
@@ -210,12 +208,12 @@ class Workspace:
     @property
     def kernel(self) -> CompiledKernel:
         """The strategy's own kernel, compiled for all its axes."""
-        return self._compile(self.variant.kernel_path, self.variant.kernel, self.constants)
+        return self.compile(self.variant.kernel_path, self.variant.kernel, self.constants)
 
     def helper(self, stem: str, uses: tuple[str, ...] = (), **constants: object) -> CompiledKernel:
         """A shipped preprocessing kernel. ``uses``: the constants it depends on; the others stay neutral."""
         chosen = NEUTRAL | {name: self.constants[name] for name in uses} | constants
-        return self._compile(Path(stem), stem, chosen)
+        return self.compile(Path(stem), stem, chosen)
 
     def cover(self, threads: int, *args: Any, kernel: CompiledKernel | None = None) -> tuple[Launch, ...]:
         """One launch of at least ``threads`` threads in one dimension; none for zero threads."""
@@ -234,13 +232,4 @@ class Workspace:
         self, count: int, threads: int, *args: Any, kernel: CompiledKernel | None = None
     ) -> tuple[Launch, ...]:
         """One launch of ``count`` thread blocks of ``threads`` threads; none where count is zero."""
-        kernel = kernel or self.kernel
-        if count >= INT32_LIMIT:
-            raise InputError(f"{kernel.entry} needs {count} thread blocks, a launch has at most 2^31 - 1")
-        return (Launch(kernel.entry, kernel, (count, 1, 1), (threads, 1, 1), args),) if count else ()
-
-    def _compile(self, path: Path, entry: str, constants: Mapping[str, object]) -> CompiledKernel:
-        key = (path, tuple(constants.items()))
-        if key not in self._kernels:
-            self._kernels[key] = self.device.compile(load_source(path, constants), entry)
-        return self._kernels[key]
+        return self.launch(kernel or self.kernel, count, threads, *args)

@@ -1,0 +1,141 @@
+"""One primitive through the whole flow: inputs -> build -> run -> check -> count or measure -> Record."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mpmbench.device import Device, run_all
+from mpmbench.environment import Environment
+from mpmbench.errors import InputError
+from mpmbench.launcher import INT32_LIMIT
+from mpmbench.measure import Sampling, measure_steps
+from mpmbench.primitives import Arrays, Bench, Built, Primitive, resolve_axes, why_impossible
+from mpmbench.record import Check, DatasetSummary, Record
+from mpmbench.runner import format_axis, free_bytes, kernel_facts
+from mpmbench.workspace import Step
+
+SEED = 1
+
+
+@dataclass(frozen=True)
+class PrimitiveCase:
+    """One primitive on one size with one choice of axes. ``preset_row``: the published row it repeats, if any."""
+
+    primitive: Primitive
+    size: int
+    axes: Mapping[str, Any]
+    seed: int = SEED
+    preset_row: Mapping[str, Any] | None = None
+
+    @property
+    def title(self) -> str:
+        """For progress lines: the primitive, its size and what differs from its defaults."""
+        defaults = resolve_axes(self.primitive, {})
+        differing = [f"{k}={format_axis(v)}" for k, v in self.axes.items() if defaults.get(k) != v]
+        return " ".join([self.primitive.name, str(self.size), *differing])
+
+    def run(self, device: Device, environment: Environment, sampling: Sampling | None = None) -> Record:
+        """``run_primitive`` for this case."""
+        return run_primitive(
+            self.primitive, device, self.axes, self.size, self.seed, environment, sampling, self.preset_row
+        )
+
+    def resume_key(self, device: Device) -> tuple[Any, ...]:
+        """Equal to ``runner.resume_key`` of the Record that this case would repeat."""
+        axes = tuple(sorted((key, format_axis(value)) for key, value in self.axes.items()))
+        fingerprint = _fingerprint(self.primitive.operation.inputs(self.axes, self.size, self.seed))
+        row = self.preset_row or {}
+        where = (device.name, device.arch)
+        return (self.primitive.name, axes, fingerprint, where, row.get("table"), row.get("row"))
+
+
+def primitive_cases(
+    primitives: Iterable[Primitive], axes: Mapping[str, Sequence[Any]], size: int | None, seed: int | None
+) -> list[PrimitiveCase]:
+    """The product of primitives and the axis values asked for; a primitive ignores an axis that it does not have."""
+    cases = []
+    for primitive in primitives:
+        names = [name for name in axes if name in primitive.axes]
+        for values in itertools.product(*(axes[name] for name in names)):
+            chosen = resolve_axes(primitive, dict(zip(names, values, strict=True)))
+            count = primitive.operation.default_size if size is None else size
+            cases.append(PrimitiveCase(primitive, count, chosen, SEED if seed is None else seed))
+    return cases
+
+
+def build_primitive(primitive: Primitive, device: Device, axes: Mapping[str, Any], inputs: Arrays, size: int) -> Built:
+    """Upload and compile; ``axes`` as ``resolve_axes`` returns them."""
+    return primitive.build(Bench(primitive, axes, size, inputs, device))
+
+
+def run_primitive(
+    primitive: Primitive,
+    device: Device,
+    axes: Mapping[str, Any],
+    size: int,
+    seed: int,
+    environment: Environment,
+    sampling: Sampling | None = None,
+    preset_row: Mapping[str, Any] | None = None,
+) -> Record:
+    """Run, check, and count or measure a primitive. What goes wrong becomes the record's reason, not an exception.
+
+    axes: as ``resolve_axes`` returns them.  size: of the input, in the operation's unit.
+    """
+    operation = primitive.operation
+    if not 0 <= size < INT32_LIMIT:
+        raise InputError(f"size {size} is out of range: kernels count {operation.unit} from 0 to 2^31 - 1")
+    begin = time.perf_counter()
+    inputs = operation.inputs(axes, size, seed)
+    about: dict[str, Any] = {
+        "variant": primitive.name,
+        "variant_summary": primitive.summary,
+        "transfer": operation.name,
+        "dataset": DatasetSummary.of_array(f"{size} {operation.unit}", size, seed, _fingerprint(inputs)),
+        "axes": dict(axes),
+        "default_axes": resolve_axes(primitive, {}),
+        "device": device.name,
+        "arch": device.arch,
+        "environment": environment,
+        "preset_row": preset_row,
+        "floor_bytes": operation.floor(axes, size),
+    }
+    if device.name.partition(":")[0] not in primitive.devices:
+        return Record(**about, skipped_because=f"runs on {' and '.join(primitive.devices)} only")
+    if reason := why_impossible(primitive, axes):
+        return Record(**about, skipped_because=reason)
+    if (least := about["floor_bytes"]) > (free := free_bytes(device)):
+        return Record(
+            **about, skipped_because=f"needs {least / 2**30:.2f} GiB, {device.name} has {free / 2**30:.2f} free"
+        )
+    try:
+        built = build_primitive(primitive, device, axes, inputs, size)
+        findings = [*run_all(device, built.before).findings]
+        report = run_all(device, built.launches)
+        outputs = {name: np.asarray(device.download(array)) for name, array in built.outputs.items()}
+        check = operation.check(inputs, outputs, axes)
+        about |= kernel_facts(device, built.launches, report.counters)
+    except InputError as error:
+        return Record(**about, failed_because=str(error), host_seconds=time.perf_counter() - begin)
+    about |= {"check": Check.of(check), "findings": (*findings, *report.findings)}
+    if device.name != "simulated" and check.passed:
+        before = [Step("before", built.before)] if built.before else []
+        step = Step("transfer", built.launches)
+        times = measure_steps(device, [step], before=before, sampling=sampling)  # type: ignore[arg-type]
+        about["transfer_measurement"] = times[step.name]
+    return Record(**about, host_seconds=time.perf_counter() - begin)
+
+
+def _fingerprint(inputs: Arrays) -> str:
+    digest = hashlib.sha256()
+    for name, array in sorted(inputs.items()):
+        digest.update(f"{name} {array.dtype} {array.shape}\n".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
