@@ -36,6 +36,7 @@ test-all: lint
 bench: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[peers]'
 	$(BIN)/python benchmarks/engine_vs_cpu.py
+	$(BIN)/python benchmarks/compile_and_count.py
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info

@@ -52,7 +52,12 @@ class Peer:
         call = getattr(self._library, function)
         call.restype = None
         count = ctypes.c_int(scene.count)
-        return lambda: call(domain, count, *pointers)
+
+        def launch(_keep_alive: tuple[np.ndarray, ...] = arrays) -> None:
+            # A ctypes pointer does not hold its array.
+            call(domain, count, *pointers)
+
+        return launch
 
     def p2g(self, scene: Scene, nodes: np.ndarray):
         """A call that adds all particles into ``nodes`` (nodes, 4)."""

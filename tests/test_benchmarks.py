@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import sys
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -175,6 +177,19 @@ def test_peers_agree_with_the_reference(peer, scene):
     place = np.argsort(scene.to_given)
     verdict = check_g2p(ParticleValues(results[place, :3]), reference.g2p(scene.dataset, velocity, "cubic"))
     assert verdict.passed, verdict
+
+
+def test_a_launch_keeps_its_arrays_alive(peer, scene):
+    from scenes import aligned
+
+    nodes = aligned((scene.grid.node_count, 4))
+    held = weakref.ref(nodes)
+    run = peer.p2g(scene, nodes)
+    del nodes
+    gc.collect()
+    run()
+    assert held() is not None
+    assert held()[:, 3].sum() > 0
 
 
 def test_sorted_scenes_walk_the_cells_in_memory_order(scene):
