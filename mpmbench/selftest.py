@@ -1,7 +1,7 @@
 """Does this device run every strategy right? Small datasets, each result held to the float64 reference.
 
 On a GPU each result is also compared with the simulated device's, and the transfer is timed. Continuous integration
-runs the same function on the simulated device.
+runs the same function on the simulated device, in its debug mode, where a finding fails as much as a wrong result.
 """
 
 from __future__ import annotations
@@ -80,6 +80,8 @@ def run_selftest(device_name: str, quick: bool = False, arch: str | None = None)
     arch: what the simulated device compiles for. Raises InputError where the device cannot be opened.
     """
     options = {"arch": arch} if arch else {}
+    if device_name == "simulated":
+        options["mode"] = "debug"
     device = open_device(device_name, **options)
     twin = None if device.name == "simulated" else open_device("simulated", arch=device.arch, mode="run")
     rows = []
