@@ -68,12 +68,14 @@ def main() -> None:
 def _selection(command: Callable[..., Any]) -> Callable[..., Any]:
     """The options that choose variants, datasets, axes and the device; shared by run and check."""
     options = [
-        click.option("-b", "--benchmark", "patterns", multiple=True, metavar="GLOB", help="Variants by name or glob."),
+        click.option("-b", "--benchmark", "patterns", multiple=True, metavar="GLOB",
+                     help="Variants and primitives by name or glob. Default: every variant."),
         click.option("--dataset", "datasets", multiple=True, metavar="NAME|FILE",
                      help="Recipe name, or a .npz/.npy file of your own particles. Default: uniform_cube."),
         click.option("-a", "--axis", "axes", multiple=True, metavar="AXIS=VALUES",
                      help='Axis values: -a dtype=float64, -a "batching=[1,2,4]", -a "block_shape=[8x4x4,4x4x4]".'),
         click.option("--particles", type=click.IntRange(min=0), help="Particles of recipe datasets."),
+        click.option("--size", type=click.IntRange(min=0, max=2**31 - 1), help="Elements that a primitive works on."),
         click.option("--particles-per-cell", "--ppc", type=click.IntRange(min=1), help="Density where it is exact."),
         click.option("--seed", type=click.IntRange(min=0), help="Seed of recipe datasets."),
         click.option("--grid-shape", metavar="NXxNYxNZ", help="Nodes per axis; a .npy file carries no grid."),
@@ -96,6 +98,7 @@ def _choose(
     datasets: Sequence[str],
     axes: Sequence[str],
     particles: int | None,
+    size: int | None,
     particles_per_cell: int | None,
     seed: int | None,
     grid_shape: str | None,
@@ -106,38 +109,35 @@ def _choose(
     preset_name: str | None = None,
 ) -> list[Any]:
     """The cases that the options ask for."""
-    from dataclasses import replace
-
-    from mpmbench import presets
+    from mpmbench import presets, primitives, variants
     from mpmbench.dataset import list_datasets
+    from mpmbench.primitive_runs import primitive_cases
     from mpmbench.runner import DatasetChoice, cases_of
-    from mpmbench.variants import discover
 
+    limit = particles if particles is not None else QUICK_PARTICLES if quick else None
+    size = size if size is not None else QUICK_SIZE if quick else None
     if preset_name is not None:
         if datasets or axes:
             raise InputError("--preset fixes datasets and axes: leave out --dataset and -a, or leave out --preset")
-        cases = presets.preset(preset_name)
+        cases: list[Any] = list(presets.preset(preset_name))
         if patterns:
-            wanted = {v.name for v in _match(discover(), patterns)}
-            cases = [case for case in cases if case.variant.name in wanted]
-        limit = particles if particles is not None else QUICK_PARTICLES if quick else None
-        if limit is not None:
-            # A shrunken row is no repetition of the published one: it loses its place beside the printed figures.
-            cases = [
-                replace(case, dataset=replace(case.dataset, particles=limit), preset_row=None)
-                if case.dataset.particles is not None
-                else case
-                for case in cases
-            ]
-        return cases
-    variants = discover(variant_dirs)
-    chosen = _match(variants, patterns) if patterns else variants
-    size = particles if particles is not None else QUICK_PARTICLES if quick else None
+            everything = [*variants.discover(), *primitives.discover()]
+            wanted = {strategy.name for strategy in _match(everything, patterns)}
+            cases = [case for case in cases if case.name in wanted]
+        return [case.shrunk(particles=limit, size=size) for case in cases]
+    shipped = list(variants.discover(variant_dirs))
+    chosen = _match([*shipped, *primitives.discover(variant_dirs)], patterns) if patterns else shipped
+    transfers = [strategy for strategy in chosen if isinstance(strategy, variants.Variant)]
+    blocks = [strategy for strategy in chosen if isinstance(strategy, primitives.Primitive)]
+    given = dict(map(_parse_axis, axes))
+    known = {name for strategy in chosen for name in strategy.axes}
+    if unknown := [name for name in given if name not in known]:
+        raise InputError(f"unknown axis {unknown[0]!r}: valid are {', '.join(sorted(known))}")
     sizable = {recipe.name for recipe in list_datasets() if "particles" in recipe.parameters}
     choices = [
         DatasetChoice(
             name,
-            size if name in sizable else particles,
+            limit if name in sizable else particles,
             particles_per_cell,
             seed,
             _parse_shape(grid_shape),
@@ -146,10 +146,12 @@ def _choose(
         )
         for name in datasets or ("uniform_cube",)
     ]
-    return cases_of(chosen, choices, dict(map(_parse_axis, axes)))
+    of_transfers = {name: values for name, values in given.items() if any(name in t.axes for t in transfers)}
+    return [*cases_of(transfers, choices, of_transfers), *primitive_cases(blocks, given, size, seed)]
 
 
 QUICK_PARTICLES = 20_000
+QUICK_SIZE = 65_536  # of primitives
 
 
 def _parse_shape(text: str | None) -> tuple[int, int, int] | None:
@@ -167,7 +169,7 @@ def _match(variants: Iterable[Any], patterns: Sequence[str]) -> list[Any]:
     for pattern in patterns:
         found = [v for v in variants if fnmatch.fnmatchcase(v.name, pattern)]
         if not found:
-            raise InputError(f"no variant matches {pattern!r}: valid are {', '.join(v.name for v in variants)}")
+            raise InputError(f"nothing matches {pattern!r}: valid are {', '.join(v.name for v in variants)}")
         chosen += [v for v in found if v not in chosen]
     return chosen
 
@@ -209,16 +211,17 @@ def _gpu_present() -> bool:
 @click.option("--variants", "variant_dirs", multiple=True, type=click.Path(path_type=Path), metavar="DIR")
 @click.option("--json", "as_json", is_flag=True, help="Machine-readable.")
 def list_command(variant_dirs: Sequence[Path], as_json: bool) -> None:
-    """Variants with their axes, datasets, presets and devices. Runs nothing."""
-    from mpmbench import presets
+    """Variants and primitives with their axes, datasets, presets and devices. Runs nothing."""
+    from mpmbench import presets, primitives
     from mpmbench.api import list_datasets, list_devices
-    from mpmbench.runner import format_axis
-    from mpmbench.variants import discover, resolve_axes
+    from mpmbench.variants import discover
 
     variants = discover(variant_dirs)
+    blocks = primitives.discover(variant_dirs)
     if as_json:
         content = {
             "variants": {v.name: {"summary": v.summary, "axes": _axis_values(v)} for v in variants},
+            "primitives": {p.name: {"summary": p.summary, "axes": _axis_values(p)} for p in blocks},
             "datasets": {d.name: d.summary for d in list_datasets()},
             "presets": list(presets.PRESETS),
             "devices": {d.name: d.summary for d in list_devices()},
@@ -227,6 +230,7 @@ def list_command(variant_dirs: Sequence[Path], as_json: bool) -> None:
         return
     for title, rows in (
         ("Variants", [(v.name, v.summary) for v in variants]),
+        ("Primitives", [(p.name, p.summary) for p in blocks]),
         ("Datasets", [(d.name, d.summary) for d in list_datasets()]),
         ("Presets", [(name, (make.__doc__ or "").split("\n")[0]) for name, make in presets.PRESETS.items()]),
         ("Devices", [(d.name, d.summary) for d in list_devices()]),
@@ -236,13 +240,23 @@ def list_command(variant_dirs: Sequence[Path], as_json: bool) -> None:
             table.add_row(name, summary)
         console.print(table)
         console.print()
+    _print_axes("Axes", [(v.name, v.axes) for v in variants])
+    for operation in dict.fromkeys(p.operation.name for p in blocks):
+        console.print()
+        _print_axes(f"Axes of {operation}", [(p.name, p.axes) for p in blocks if p.operation.name == operation])
+
+
+def _print_axes(title: str, strategies: Sequence[tuple[str, Any]]) -> None:
+    """Each axis with its usual default first, and whose default differs."""
+    from mpmbench.runner import format_axis
+
     heads = ("axis", "values, usual default first", "other default")
-    table = RichTable(*heads, title="Axes", title_justify="left", box=None, padding=(0, 2, 0, 0))
-    for name in dict.fromkeys(name for v in variants for name in v.axes):
-        defaults = {v.name: resolve_axes(v, {})[name] for v in variants if name in v.axes}
-        usual = Counter(map(format_axis, defaults.values())).most_common(1)[0][0]
-        values = dict.fromkeys([usual, *(format_axis(value) for v in variants for value in v.axes.get(name, ()))])
-        others = [f"{v}: {format_axis(value)}" for v, value in defaults.items() if format_axis(value) != usual]
+    table = RichTable(*heads, title=title, title_justify="left", box=None, padding=(0, 2, 0, 0))
+    for name in dict.fromkeys(name for _, axes in strategies for name in axes):
+        defaults = {who: format_axis(axes[name][0]) for who, axes in strategies if name in axes}
+        usual = Counter(defaults.values()).most_common(1)[0][0]
+        values = dict.fromkeys([usual, *(format_axis(value) for _, axes in strategies for value in axes.get(name, ()))])
+        others = [f"{who}: {value}" for who, value in defaults.items() if value != usual]
         table.add_row(name, "  ".join(values), ", ".join(others))
     console.print(table)
 
@@ -392,6 +406,7 @@ def env() -> None:
 def _run_cases(cases: list[Any], devices: list[Any], json_path: Path | None, existing: Any, quick: bool) -> list[Any]:
     from mpmbench import measure
     from mpmbench.environment import Environment
+    from mpmbench.primitive_runs import PrimitiveCase
     from mpmbench.record import RecordWriter, read_records
     from mpmbench.runner import Inputs, resume_key, run_case
 
@@ -400,7 +415,7 @@ def _run_cases(cases: list[Any], devices: list[Any], json_path: Path | None, exi
     kept: dict[Any, Any] = {}
     if json_path is not None and existing == "append" and json_path.exists():
         kept = {resume_key(record): record for record in read_records(json_path)}
-    for choice in dict.fromkeys(case.dataset for case in cases):
+    for choice in dict.fromkeys(case.dataset for case in cases if not isinstance(case, PrimitiveCase)):
         choice.load()  # bad input is refused before any file is touched and before an hour of work
     environment = Environment.capture()
     sampling = measure.QUICK if quick else None
@@ -414,9 +429,14 @@ def _run_cases(cases: list[Any], devices: list[Any], json_path: Path | None, exi
             for device in devices:
                 for case in cases:
                     progress.update(task, description=f"{device.name} {case.title}")
-                    record = kept.get(resume_key(case, device, inputs)) if kept else None
+                    block = isinstance(case, PrimitiveCase)
+                    key = (case.resume_key(device) if block else resume_key(case, device, inputs)) if kept else None
+                    record = kept.get(key)
                     if record is None:
-                        record = run_case(case, device, inputs, environment, sampling)
+                        if block:
+                            record = case.run(device, environment, sampling)
+                        else:
+                            record = run_case(case, device, inputs, environment, sampling)
                         if writer:
                             writer.write(record)
                     records.append(record)

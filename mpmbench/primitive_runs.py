@@ -6,7 +6,7 @@ import hashlib
 import itertools
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,14 @@ class PrimitiveCase:
     axes: Mapping[str, Any]
     seed: int = SEED
     preset_row: Mapping[str, Any] | None = None
+
+    @property
+    def name(self) -> str:
+        return self.primitive.name
+
+    def shrunk(self, particles: int | None = None, size: int | None = None) -> PrimitiveCase:
+        """This case at another size: no repetition of a published row."""
+        return self if size is None else replace(self, size=size, preset_row=None)
 
     @property
     def title(self) -> str:

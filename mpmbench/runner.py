@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -59,6 +59,16 @@ class Case:
     dataset: DatasetChoice
     axes: Mapping[str, Any]
     preset_row: Mapping[str, Any] | None = None
+
+    @property
+    def name(self) -> str:
+        return self.variant.name
+
+    def shrunk(self, particles: int | None = None, size: int | None = None) -> Case:
+        """This case with so many particles, where its dataset has a choice: no repetition of a published row."""
+        if particles is None or self.dataset.particles is None:
+            return self
+        return replace(self, dataset=replace(self.dataset, particles=particles), preset_row=None)
 
     @property
     def title(self) -> str:
