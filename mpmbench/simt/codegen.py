@@ -58,7 +58,7 @@ class _Generator:
         self.kernel, self.variables, self.mode = kernel, variables, mode
         self.w = Writer(lanes)
         self.lanes = lanes
-        self.segments = basic_blocks(kernel, self._ends_segment, codegen_warp.gathers)
+        self.segments = self._segments()
         self.forms = AddressForms(kernel.instructions)
         self.sites: list[Site] = []
         self.entry_values: dict[str, tuple[str, list[str]]] = {}
@@ -66,6 +66,17 @@ class _Generator:
         self.joinable = self._joinable()
         self._lay_out()
         self.labels = 0
+
+    def _segments(self) -> list[Block]:
+        segments = basic_blocks(self.kernel, self._ends_segment, codegen_warp.gathers)
+        instructions = self.kernel.instructions
+        more = codegen_memory.ordered_starts(instructions, {segment.start for segment in segments})
+        if not more:
+            return segments
+        chosen = {id(instructions[index]) for index in more}
+        return basic_blocks(
+            self.kernel, self._ends_segment, lambda item: codegen_warp.gathers(item) or id(item) in chosen
+        )
 
     def _ends_segment(self, item: Instruction) -> bool:
         if codegen_warp.is_collective(item) or codegen_warp.is_barrier(item):

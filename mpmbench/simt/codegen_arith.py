@@ -850,6 +850,9 @@ def _is_space(ctx: Lanes, item: Instruction) -> None:
 
 def is_float_arithmetic(item: Instruction) -> tuple[bool, bool, bool]:
     """Which flushing the instruction asks for: (f32 with .ftz, f32 without, f64), as far as the FPU computes it."""
+    if item.root in ("atom", "red"):
+        # Float sums in global memory flush denormals whatever the compiler was asked for.
+        return {"add", "f32"} <= set(item.modifiers) and "shared" not in item.modifiers, False, False
     if item.root not in _FPU_ROOTS:
         return False, False, False
     kinds = item.modifiers

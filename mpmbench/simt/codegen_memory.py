@@ -8,7 +8,7 @@ adds to neighbouring words become one wide add. That is one of the orders the me
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -120,7 +120,7 @@ def emit_access(ctx: SegmentBody, index: int, item: Instruction) -> None:
             flush_deferred(ctx)
             _atomic(ctx, index, item, access, address, values, used)
         return
-    if not (item.root == "ld" and ("nc" in item.modifiers or access.space == "local")):
+    if _sees_deferred(item):
         flush_deferred(ctx)
     if item.root == "ld":
         _load(ctx, index, item, access, address)
@@ -517,7 +517,7 @@ def _combine(ctx: SegmentBody, access: Access, element: str, old: str, values: S
     value = values[0]
     if is_float(access.kind):
         if operation == "add":
-            return _flushed_scalar(ctx, access, w.value(f"fadd {element} {old}, {value}"))
+            return _float_sum(ctx, access, element, 1, old, value)
         raise Refused
     if operation in ("add", "and", "or", "xor"):
         return w.value(f"{operation} {element} {old}, {value}")
@@ -538,17 +538,21 @@ def _combine(ctx: SegmentBody, access: Access, element: str, old: str, values: S
     return w.value(f"select i1 {wraps}, {element} {value}, {element} {less_one}")
 
 
-def _flushed_scalar(ctx: SegmentBody, access: Access, value: str) -> str:
-    """``atom.add.f32`` on global memory flushes denormals; where the processor does not, code does."""
-    if access.kind != "f32" or access.space == "shared" or ctx.hardware_ftz or not ctx.explicit_ftz:
-        return value
+def _float_sum(ctx: SegmentBody, access: Access, kind: str, length: int, old: str, value: str) -> str:
+    """Sum of scalars, or of vectors of ``length``. kind: their LLVM type.
+
+    f32 sums in global memory flush denormals (PTX ISA, ``atom``): where the processor does not, code does. Sums in
+    shared memory keep them, save in kernels for which the processor flushes.
+    """
     w = ctx.w
-    lanes, w.lanes = w.lanes, 1
-    vector = w.value(f"insertelement <1 x float> poison, float {value}, i32 0")
-    flushed = flush(w, vector)
-    result = w.value(f"extractelement <1 x float> {flushed}, i32 0")
+    if access.kind != "f32" or access.space == "shared" or ctx.hardware_ftz:
+        return w.value(f"fadd {kind} {old}, {value}")
+    lanes, w.lanes = w.lanes, length
+    if length == 1:
+        old, value = (w.value(f"insertelement <1 x float> poison, float {term}, i32 0") for term in (old, value))
+    total = flush(w, w.binary("fadd", "float", flush(w, old), flush(w, value)))
     w.lanes = lanes
-    return result
+    return total if length > 1 else w.value(f"extractelement <1 x float> {total}, i32 0")
 
 
 def _defer_add(ctx: SegmentBody, index: int, access: Access, address: Address, operand: Operand) -> None:
@@ -574,6 +578,48 @@ def flush_deferred(ctx: SegmentBody) -> None:
         _count_run(ctx, run)
     for mask, runs in by_mask.items():
         _add_runs(ctx, mask, runs)
+
+
+def ordered_starts(instructions: Sequence[Instruction], borders: Container[int]) -> set[int]:
+    """Where a segment must start so that the order of atomics does not depend on how many lanes a chunk has.
+
+    Adds that are put off run at the end of their segment, lane after lane: in one order for every chunk width, if a
+    segment carries them out only once and under one mask. An atomic whose result is used stands alone.
+    borders: instructions that start a segment anyway.
+    """
+    read = {reg for item in instructions for reg in item.reads()}
+    starts: set[int] = set()
+    pending: tuple[Reg | None, bool] | None = None
+    after_used = False
+    for index, item in enumerate(instructions):
+        if index in borders:
+            pending = None
+        elif after_used:
+            starts.add(index)
+        after_used = False
+        if item.root in ("atom", "red"):
+            guard = (item.guard, item.negated)
+            if "add" in item.modifiers and not any(dst in read for dst in item.dsts):
+                if pending not in (None, guard):
+                    starts.add(index)
+                pending = guard
+            else:
+                starts.add(index)
+                pending, after_used = None, True
+        elif item.root in ("membar", "fence") or _sees_deferred(item):
+            if pending is not None:
+                starts.add(index)
+            pending = None
+        elif pending is not None and pending[0] is not None and pending[0] in item.writes():
+            pending = (None, True)  # the guard's old value: equal to no other
+    return starts
+
+
+def _sees_deferred(item: Instruction) -> bool:
+    """Whether a load or store must find the adds that were put off carried out."""
+    if item.root not in ("ld", "st") or {"param", "const"} & set(item.modifiers):
+        return False
+    return not (item.root == "ld" and {"nc", "local"} & set(item.modifiers))
 
 
 def _count_run(ctx: SegmentBody, run: list[Deferred]) -> None:
@@ -639,16 +685,10 @@ def _add_runs(ctx: SegmentBody, mask: str, runs: list[list[Deferred]]) -> None:
             size = ELEMENT_BYTES[element]
             value = w.load(kind, w.value(f"getelementptr {element}, ptr {values}, i64 {at}"), size * length)
             old = w.load(kind, pointer, size)
-            if not is_float(first.access.kind):
-                new = w.value(f"add {kind} {old}, {value}")
+            if is_float(first.access.kind):
+                new = _float_sum(ctx, first.access, kind, length, old, value)
             else:
-                new = w.value(f"fadd {kind} {old}, {value}")
-                if length == 1:
-                    new = _flushed_scalar(ctx, first.access, new)
-                elif first.access.kind == "f32" and first.access.space != "shared" and ctx.explicit_ftz:
-                    lanes, w.lanes = w.lanes, length
-                    new = flush(w, new)
-                    w.lanes = lanes
+                new = w.value(f"add {kind} {old}, {value}")
             w.store(kind, new, pointer, size)
 
     _for_each_lane(ctx, mask, body)

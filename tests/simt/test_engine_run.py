@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from engine_programs import kernel, run
+from engine_programs import OPTIONS, kernel, run
 
 from mpmbench.errors import InputError
 from mpmbench.simt import engine, nvrtc
@@ -413,3 +413,44 @@ def test_run_and_count_give_the_same_bits(rng):
     np.testing.assert_allclose(grids[0], want, atol=2e-4)
     for grid in grids[1:]:
         np.testing.assert_array_equal(grid.view(I32), grids[0].view(I32))
+
+
+@pytest.mark.parametrize("space", ["global", "shared"])
+def test_sums_of_floats_do_not_depend_on_the_chunk_width(space, rng):
+    """Adds between loads, under two masks, in loops, and with used results: one order, whatever the lanes at a time."""
+    x = rng.normal(size=(200, 4)).astype(np.float32)
+    place = rng.integers(0, 12, 200).astype(I32)
+    body = f"""(const float4* x, const int* place, float* out, float* seen) {{
+        __shared__ float s[64]; int t = threadIdx.x; float* g = {"s" if space == "shared" else "out"};
+        volatile float* v = g;
+        if ({int(space == "shared")} && t < 64) s[t] = 0;
+        __syncthreads();
+        float4 p = x[t]; int b = 4 * place[t];
+        atomicAdd(g + b, p.x); atomicAdd(g + b + 1, p.y);
+        float sum = v[b] * 0;
+        atomicAdd(g + b, p.y + sum); atomicAdd(g + b + 1, p.z);
+        if (p.z > 0) atomicAdd(g + b + 2, p.z); if (p.w > 0) atomicAdd(g + b + 2, p.w);
+        atomicAdd(g + b + 1, p.w + sum); atomicAdd(g + b + 2, p.x);
+        atomicAdd(g + b + 3, p.y); atomicAdd(g + b + 4, p.z);
+        #pragma unroll 1
+        for (int k = 0; k < (t & 3); ++k) {{ atomicAdd(g + b + k, p.x * k); atomicAdd(g + b + k + 5, p.y); }}
+        seen[t] = atomicAdd(g + 50, p.x);
+        __syncthreads();
+        if ({int(space == "shared")} && t < 64) out[t] = s[t]; }}"""
+    results = []
+    for width, mode in ((8, "run"), (16, "run"), (32, "run"), (16, "count")):
+        out, seen = np.zeros(64, np.float32), np.zeros(200, np.float32)
+        run(body, 1, 200, x, place, out, seen, lane_width=width, mode=mode)
+        results.append(np.concatenate([out, seen]).view(I32))
+    for other in results[1:]:
+        np.testing.assert_array_equal(other, results[0])
+
+
+def test_float_sums_in_global_memory_flush_denormals():
+    tiny = np.array([1e-40, 0, 3e-39, 1e-38, -1.2e-38, 1, 1, 1], np.float32)
+    for options in (OPTIONS, ("-lineinfo",)):
+        out = tiny.copy()
+        text = """extern "C" __global__ void kernel(float* o) { atomicAdd(o + threadIdx.x, -1e-38f);
+            if (threadIdx.x > 5) atomicAdd(o + threadIdx.x, 1e-37f); }"""
+        engine.compile_ptx(nvrtc.compile_cuda(text, "sm_70", options)).kernel("kernel").launch((1,), (8,), (out,))
+        np.testing.assert_array_equal(out[:5], np.array([0, 0, 0, 0, -1.2e-38], np.float32))
