@@ -367,6 +367,24 @@ def fake_cupy(gpu: FakeGpu) -> SimpleNamespace:
     return fake
 
 
+def on_the_engine(spoil: Callable[[str, tuple[Any, ...]], None] = lambda name, arguments: None) -> Callable[..., None]:
+    """For ``FakeGpu.execute``: run each kernel, compiled as CuPy would, on the simulated device's engine.
+
+    spoil: called after each kernel with its name and arguments, to play a GPU that gets something wrong.
+    """
+    from mpmbench.simt.engine import compile_ptx
+
+    modules: dict[str, Any] = {}
+
+    def execute(ptx: str, name: str, grid: Any, block: Any, arguments: tuple[Any, ...], shared_bytes: int) -> None:
+        if ptx not in modules:
+            modules[ptx] = compile_ptx(ptx, mode="run")
+        modules[ptx].kernel(name).launch(grid, block, arguments, shared_bytes=shared_bytes)
+        spoil(name, arguments)
+
+    return execute
+
+
 @functools.cache
 def compile_as_cupy_does(code: str, options: tuple[str, ...], capability: str) -> str:
     """PTX from CuPy's own binding of NVRTC, with the options that CuPy appends (cupy/cuda/compiler.py)."""

@@ -73,8 +73,12 @@ def kernels_of(variant: Variant, axes: dict[str, Any]) -> dict[str, Kernel]:
 
 def compiled(kernel: Kernel, arch: str) -> KernelInfo:
     source, entry = kernel
-    ptx = compile_cuda(source.text, arch, compile_options(arch), f"{source.name}.cu")
-    return kernel_infos(ptx, arch)[entry]
+    try:
+        ptx = compile_cuda(source.text, arch, compile_options(arch), f"{source.name}.cu")
+        return kernel_infos(ptx, arch)[entry]
+    except InputError as error:
+        constants = " ".join(f"{name}={value}" for name, value in source.constants)
+        raise InputError(f"{error} [{entry} for {arch}: {constants}]") from error
 
 
 def compile_all(jobs: Iterable[tuple[Kernel, str]]) -> list[tuple[Kernel, KernelInfo]]:

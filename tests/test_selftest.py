@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cupy
 import numpy as np
 import pytest
-from fake_cupy import FakeGpu, fake_cupy
+from fake_cupy import FakeGpu, fake_cupy, on_the_engine
 
 from mpmbench import selftest
 from mpmbench.dataset import Dataset
 from mpmbench.errors import InputError
 from mpmbench.reference import Nodes, ParticleValues, p2g
 from mpmbench.selftest import axis_changes, hardware_table, largest_difference, run_selftest
-from mpmbench.simt.engine import compile_ptx
 from mpmbench.variants import discover, get
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -47,18 +45,6 @@ def test_on_a_gpu(cuda_device: Any) -> None:
 
 
 # A GPU that is a CPU: the fake driver hands each kernel, compiled as CuPy would, to the engine.
-
-
-def on_the_engine(spoil: Callable[[str, tuple[Any, ...]], None] = lambda name, arguments: None) -> Callable[..., None]:
-    modules: dict[str, Any] = {}
-
-    def execute(ptx: str, name: str, grid: Any, block: Any, arguments: tuple[Any, ...], shared_bytes: int) -> None:
-        if ptx not in modules:
-            modules[ptx] = compile_ptx(ptx, mode="run")
-        modules[ptx].kernel(name).launch(grid, block, arguments, shared_bytes=shared_bytes)
-        spoil(name, arguments)
-
-    return execute
 
 
 @pytest.fixture
