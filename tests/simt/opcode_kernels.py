@@ -105,8 +105,8 @@ mad.lo.s32 %i, %b, %n, %t;
 mul.wide.u32 %at, %i, 8;
 add.s64 %in, %in, %at;
 add.s64 %out, %out, %at;
-shr.u32 %word, %i, 5;
-mul.wide.u32 %at, %word, 4;
+shr.u32 %warp, %i, 5;
+mul.wide.u32 %at, %warp, 4;
 add.s64 %masks, %masks, %at;
 ld.global.u32 %mask, [%masks];
 mov.u32 %lane, %laneid;
@@ -122,7 +122,7 @@ class Text:
     def __init__(self) -> None:
         self.declared = [
             ".reg .b64 %in, %out, %masks, %at;",
-            ".reg .b32 %t, %n, %b, %i, %word, %mask, %lane, %bit, %junk;",
+            ".reg .b32 %t, %n, %b, %i, %warp, %mask, %lane, %bit, %junk;",
             ".reg .pred %on;",
         ]
         self.code: list[str] = []
@@ -201,10 +201,271 @@ def lanewise_kernel(cases: tuple[Case, ...], style: str) -> str:
     return text.kernel()
 
 
-def launch_arguments(data: np.ndarray, seed: int) -> list[np.ndarray]:
-    """Input, zeroed output (cases, 2, THREADS) and masks."""
-    out = np.zeros((len(data), 2, THREADS), np.uint64)
+def launch_arguments(data: np.ndarray, seed: int, planes: int = 2) -> list[np.ndarray]:
+    """Input, zeroed output (cases, planes, THREADS) and masks."""
+    out = np.zeros((len(data), planes, THREADS), np.uint64)
     return [corpus.aligned(data), corpus.aligned(out), corpus.aligned(masks(np.random.default_rng(seed)))]
+
+
+# --- memory -----------------------------------------------------------------------------------------------------------
+
+_TYPES = ("u8", "s8", "u16", "s16", "u32", "b32", "u64", "f32", "f64")
+_SPACES = ("global", "shared", "local", "")
+ROOM = 512  # bytes that loads choose from
+OWN = 16  # bytes per thread that stores go to
+PLANES = 4  # outputs per memory case
+
+
+def memory_forms(root: str) -> tuple[str, ...]:
+    """Loads or stores of every space, type and vector length that a lane's 16 bytes allow."""
+    forms = []
+    for space in _SPACES:
+        for kind in _TYPES:
+            for count in (1, 2, 4):
+                if count * numpy_ops.DTYPES[kind].itemsize <= OWN:
+                    vector = f"v{count}" if count > 1 else ""
+                    forms.append(".".join(part for part in (root, space, vector, kind) if part))
+    return tuple(forms)
+
+
+_WINDOWS = f"""
+.shared .align 16 .b8 choice[{ROOM}];
+.shared .align 16 .b8 own[{OWN * BLOCK}];
+.local .align 16 .b8 mine[{ROOM + OWN}];
+.reg .b64 %all, %everyone, %from_global, %from_shared, %from_local, %from_any;
+.reg .b64 %to_global, %to_shared, %to_local, %to_any;
+.reg .b64 %word, %half;
+.reg .b32 %index, %quarter, %odd;
+.reg .pred %is_odd;
+"""
+
+
+def memory_kernel(forms: tuple[str, ...]) -> str:
+    """Guarded accesses: loads at an offset that the input chooses, stores to a place of the thread's own, read back."""
+    text = Text()
+    add = text.add
+    add("ld.param.u64 %all, [kernel_param_0];")
+    add("ld.param.u64 %everyone, [kernel_param_1];")
+    # Shared room: four bytes per thread. Local room: the same words, shifted by the thread's number.
+    add("ld.global.u32 %quarter, [%in];")
+    add("shl.b32 %index, %t, 2;")
+    add("cvt.u64.u32 %half, %index;")
+    add("mov.u64 %from_shared, choice;")
+    add("add.s64 %half, %from_shared, %half;")
+    add("st.shared.u32 [%half], %quarter;")
+    add("mov.u64 %from_local, mine;")
+    for at in range(0, ROOM, 8):
+        add(f"ld.global.u64 %word, [%in+{at % 64 // 8 * PLANE}];")
+        add(f"add.s64 %word, %word, {at};")
+        add(f"st.local.u64 [%from_local+{at}], %word;")
+    add("bar.sync 0;")
+    add("mul.wide.u32 %word, %t, 16;")
+    add("mov.u64 %to_shared, own;")
+    add("add.s64 %to_shared, %to_shared, %word;")
+    add(f"add.s64 %to_local, %from_local, {ROOM};")
+    add("and.b32 %odd, %t, 1;")
+    add("setp.eq.u32 %is_odd, %odd, 1;")
+    for number, form in enumerate(forms):
+        _memory_case(text, number, form)
+    return text.kernel(_WINDOWS)
+
+
+def _memory_case(text: Text, number: int, form: str) -> None:
+    root, *rest = form.split(".")
+    kind = rest[-1]
+    count = int(next((part[1] for part in rest if part in ("v2", "v4")), "1"))
+    size = count * numpy_ops.DTYPES[kind].itemsize
+    space = rest[0] if rest[0] in _SPACES else ""
+    add = text.add
+    values = [text.register(destination(kind)) for _ in range(count)]
+    listed = "{" + ", ".join(values) + "}" if count > 1 else values[0]
+    planes = [number * PLANES + position for position in range(count)]
+    if root == "ld":
+        add(f"ld.global.u32 %index, [%in+{number * SLOTS * PLANE}];")
+        add(f"and.b32 %index, %index, {ROOM // size - 1};")
+        add(f"mul.wide.u32 %word, %index, {size};")
+        add(f"add.s64 %from_global, %all, {(number * SLOTS + 1) * PLANE};")
+        add("cvta.shared.u64 %half, %from_shared;")
+        add("selp.b64 %from_any, %half, %from_global, %is_odd;")
+        add(f"add.s64 %word, %word, %from_{space or 'any'};")
+        for position, value in enumerate(values):
+            add(f"ld.global.{_REGISTER[destination(kind)]} {value}, [%in+{(number * SLOTS + 2) * PLANE}];")
+            planes[position] = number * PLANES + position
+        add(f"@%on {form} {listed}, [%word];")
+        for plane, value in zip(planes, values, strict=True):
+            text.store(destination(kind), value, plane)
+        return
+    for position, value in enumerate(values):
+        add(f"ld.global.{_REGISTER[destination(kind)]} {value}, [%in+{(number * SLOTS + position) * PLANE}];")
+    add("mul.wide.u32 %word, %i, 16;")
+    add(f"add.s64 %word, %word, {number * PLANES * PLANE};")
+    add("add.s64 %to_global, %everyone, %word;")
+    if space == "global":
+        add(f"@%on {form} [%to_global], {listed};")
+        return
+    add("cvta.shared.u64 %half, %to_shared;")
+    add("cvta.local.u64 %to_any, %to_local;")
+    add("selp.b64 %to_any, %half, %to_any, %is_odd;")
+    place = f"%to_{space or 'any'}"
+    load = f"ld.{space}.u64" if space else "ld.u64"
+    for at in (0, 8):
+        add(f"mov.u64 %word, {number + at};")
+        add(f"{load.replace('ld', 'st', 1)} [{place}+{at}], %word;")
+    add(f"@%on {form} [{place}], {listed};")
+    for at in (0, 8):
+        add(f"{load} %word, [{place}+{at}];")
+        add(f"st.global.u64 [%to_global+{at}], %word;")
+
+
+# --- atomics ----------------------------------------------------------------------------------------------------------
+
+CELLS = 8  # places that the threads of a block share
+CELL_BYTES = 16
+
+
+def atomic_forms() -> tuple[str, ...]:
+    """The atomics of the corpus, and those without a result."""
+    found = [form for form in sorted(corpus.forms()) if form.startswith("atom.")]
+    plain = [form.replace("atom", "red", 1) for form in found if not {"cas", "exch"} & set(form.split("."))]
+    return (*found, *plain)
+
+
+def atomic_kernel(forms: tuple[str, ...]) -> str:
+    """Each form has cells of its own per thread block, in a fourth argument; several lanes meet in each."""
+    text = Text()
+    add = text.add
+    per_block = len(forms) * CELLS * CELL_BYTES
+    add("ld.param.u64 %cells, [kernel_param_3];")
+    add(f"mul.wide.u32 %word, %b, {per_block};")
+    add("add.s64 %cells, %cells, %word;")
+    add("mov.u64 %shared, scratch;")
+    add("mul.wide.u32 %word, %t, 8;")
+    add("add.s64 %mine, %shared, %word;")
+    add("add.s64 %word, %cells, %word;")
+    rounds = range(0, per_block, 8 * BLOCK)
+    for at in rounds:
+        add(f"ld.global.u64 %value, [%word+{at}];")
+        add(f"st.shared.u64 [%mine+{at}], %value;")
+    add("bar.sync 0;")
+    for number, form in enumerate(forms):
+        root, space, *rest = form.split(".")
+        kind, count = rest[-1], int(next((part[1] for part in rest if part in ("v2", "v4")), "1"))
+        sources = 2 if "cas" in rest else 1
+        before = [text.load(kind, number * SLOTS + 5) for _ in range(count)]
+        operands = []
+        for source in range(sources):
+            parts = [text.load(kind, number * SLOTS + 1 + source + position) for position in range(count)]
+            operands.append("{" + ", ".join(parts) + "}" if count > 1 else parts[0])
+        listed = "{" + ", ".join(before) + "}" if count > 1 else before[0]
+        add(f"ld.global.u32 %index, [%in+{number * SLOTS * PLANE}];")
+        add(f"and.b32 %index, %index, {CELLS - 1};")
+        add(f"mul.wide.u32 %value, %index, {CELL_BYTES};")
+        add(f"add.s64 %value, %value, {number * CELLS * CELL_BYTES};")
+        add(f"add.s64 %value, %value, {'%cells' if space == 'global' else '%shared'};")
+        result = f"{listed}, " if root == "atom" else ""
+        add(f"@%on {form} {result}[%value], {', '.join(operands)};")
+        for position, name in enumerate(before):
+            text.store(kind, name, number * PLANES + position)
+    add("bar.sync 0;")
+    shared = [number for number, form in enumerate(forms) if ".shared." in form]
+    for number in shared:  # half of the threads copy the cells back, eight bytes each
+        start = number * CELLS * CELL_BYTES
+        add(f"setp.lt.u32 %first, %t, {CELLS * CELL_BYTES // 8};")
+        add(f"@%first ld.shared.u64 %value, [%mine+{start}];")
+        add(f"@%first st.global.u64 [%word+{start}], %value;")
+    extra = f""".shared .align 16 .b8 scratch[{-(-per_block // (8 * BLOCK)) * 8 * BLOCK}];
+.reg .b64 %cells, %word, %shared, %mine, %value;
+.reg .b32 %index;
+.reg .pred %first;"""
+    return text.kernel(extra).replace("kernel_param_2)", "kernel_param_2, .param .u64 kernel_param_3)")
+
+
+def atomic_arguments(forms: tuple[str, ...], seed: int) -> list[np.ndarray]:
+    """As for other kernels, and the cells: (blocks, forms, CELLS, CELL_BYTES / 8) uint64, padded.
+
+    No f32 sum is subnormal: PTX has them flushed in global and kept in shared memory, while the engine does in both as
+    the processor's mode has it for the kernel's arithmetic.
+    """
+    rng = np.random.default_rng(seed)
+    kinds = [form.split(".")[-1] for form in forms]
+    data = rng.integers(0, 1 << 64, (len(forms), SLOTS, THREADS), dtype=np.uint64)
+    blocks = THREADS // BLOCK
+    cells = np.zeros((blocks, len(forms), CELLS, CELL_BYTES // 8), np.uint64)
+    for number, kind in enumerate(kinds):
+        for slot in range(1, SLOTS):
+            data[number, slot] = operands(rng, kind)
+        few = rng.integers(0, 3, (blocks, CELLS, CELL_BYTES // 8)).astype(np.uint64)
+        cells[:, number] = few if "cas" in forms[number] else operands(rng, kind)[: few.size].reshape(few.shape)
+        if "cas" in forms[number]:
+            data[number, 1] = rng.integers(0, 3, THREADS)
+            data[number, 2] = rng.integers(0, 3, THREADS)
+        if kind == "f32":  # two values in each word of the input, so that vectors have no empty elements
+            cells[:, number] |= cells[:, number] << np.uint64(32)
+            for words in (data[number], cells[:, number]):
+                values = words.view(np.float32)
+                values[np.abs(values) < 1e-25] = 0.0
+    padded = np.concatenate([cells.reshape(-1), np.zeros(8 * BLOCK, np.uint64)])
+    return [*launch_arguments(data, seed, PLANES), corpus.aligned(padded)]
+
+
+def same_values(form: str, got: np.ndarray, want: np.ndarray) -> bool:
+    """Equal bits; for floats any NaN equals any NaN."""
+    kind = form.split(".")[-1]
+    if kind not in ("f32", "f64"):
+        return bool(np.array_equal(got, want))
+    a, b = (np.ascontiguousarray(x).view(f"f{int(kind[1:]) // 8}") for x in (got, want))
+    bits = [x.view(f"u{x.dtype.itemsize}") for x in (a, b)]
+    return bool(np.all((bits[0] == bits[1]) | (np.isnan(a) & np.isnan(b))))
+
+
+# --- operations across lanes ------------------------------------------------------------------------------------------
+
+
+def warp_forms() -> tuple[str, ...]:
+    roots = ("shfl", "vote", "match", "redux", "activemask")
+    return tuple(form for form, item in sorted(corpus.forms().items()) if item.root in roots)
+
+
+def warp_kernel(forms: tuple[str, ...]) -> str:
+    """Behind one branch, with the lanes' own mask as the member mask. Of a shuffle the last plane holds the lane that
+    it read from, so that reads of absent lanes can be left out."""
+    text = Text()
+    add = text.add
+    bodies: list[list[str]] = []
+    results: list[list[tuple[str, str]]] = []
+    for number, form in enumerate(forms):
+        root, *rest = form.split(".")
+        first = text.load("b64" if rest[-1] == "b64" else "b32", number * SLOTS)
+        second, third = (text.load("b32", number * SLOTS + slot) for slot in (1, 2))
+        out, source = (text.load("b32", number * SLOTS + slot) for slot in (3, 4))
+        flag = text.load("pred", number * SLOTS + 5)
+        body = []
+        if root == "shfl":
+            # Segments of 1 to 32 lanes; clamps anywhere.
+            body += [f"and.b32 {third}, {third}, 7967;"]
+            body += [f"{form} {source}, %lane, {second}, {third}, %mask;"]
+            body += [f"{form} {out}|{flag}, {first}, {second}, {third}, %mask;"]
+        elif root == "vote":
+            body += [f"setp.lt.s32 {flag}, {first}, {second};"]
+            body += [f"{form} {flag if rest[-1] == 'pred' else out}, {flag}, %mask;"]
+        elif root == "match":
+            limit = f"and.{rest[-1]} {first}, {first}, {3 if 'any' in rest else 0};"
+            both = f"{out}|{flag}" if "all" in rest else out
+            body += [limit, f"{form} {both}, {first}, %mask;"]
+        elif root == "redux":
+            body += [f"{form} {out}, {first}, %mask;"]
+        else:
+            body += [f"{form} {out};"]
+        bodies.append(body)
+        results.append([("b32", out), ("pred", flag), ("b32", source)])
+    add("@!%on bra AFTER;")
+    for body in bodies:
+        text.code += body
+    add("AFTER:")
+    for number, outputs in enumerate(results):
+        for position, (kind, name) in enumerate(outputs):
+            text.store(kind, name, number * PLANES + position)
+    return text.kernel()
 
 
 # --- comparison -------------------------------------------------------------------------------------------------------

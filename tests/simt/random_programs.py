@@ -317,7 +317,8 @@ def ptx_program(seed: int) -> Program:
         if kind < 0.88:
             return f"activemask.b32 {reg()};"
         if kind < 0.94:
-            return f"and.b32 %k, {reg()}, 60;\ncvt.u64.u32 %w, %k;\nadd.s64 %w, %sums, %w;\n{guard}red.global.add.u32 [%w], 3;"
+            place = f"and.b32 %k, {reg()}, 60;\ncvt.u64.u32 %w, %k;\nadd.s64 %w, %sums, %w;\n"
+            return f"{place}{guard}red.global.add.u32 [%w], 3;"
         return f"{guard}st.global.u32 [%out+28], {reg()};\nld.global.u32 {reg()}, [%out+28];"
 
     def ending(number: int) -> str:

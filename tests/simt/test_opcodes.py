@@ -23,6 +23,11 @@ def run_engine(text: str, arguments: list[np.ndarray], lane_width: int = 16) -> 
     assert module.kernel("kernel").launch(*SHAPE, arguments).findings == ()
 
 
+def batches(forms: tuple[str, ...]) -> list:
+    parts = [forms[at : at + BATCH] for at in range(0, len(forms), BATCH)]
+    return [pytest.param(part, id=f"{part[0]} to {part[-1]}") for part in parts]
+
+
 def lanewise_batches() -> list:
     cases = opcodes.lanewise_cases()
     batches = [cases[at : at + BATCH] for at in range(0, len(cases), BATCH)]
@@ -45,3 +50,55 @@ def test_lanewise_forms(cases, style):
             if differ.any():
                 wrong.append(opcodes.describe(case, data[number], slot, *pair, differ))
     assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("forms", batches((*opcodes.memory_forms("ld"), *opcodes.memory_forms("st"))))
+def test_loads_and_stores(forms):
+    rng = np.random.default_rng(len(forms[0]))
+    data = rng.integers(0, 1 << 64, (len(forms), opcodes.SLOTS, opcodes.THREADS), dtype=np.uint64)
+    text = opcodes.memory_kernel(forms)
+    want, got = (opcodes.launch_arguments(data, 2, opcodes.PLANES) for _ in range(2))
+    run_oracle(text, want)
+    run_engine(text, got)
+    wrong = [form for form, a, b in zip(forms, got[1], want[1], strict=True) if not np.array_equal(a, b)]
+    assert not wrong
+    assert all(plane.any() for plane in want[1])
+
+
+@pytest.mark.parametrize("forms", batches(opcodes.atomic_forms()))
+def test_atomics(forms):
+    text = opcodes.atomic_kernel(forms)
+    want, got = (opcodes.atomic_arguments(forms, 3) for _ in range(2))
+    start = want[3].copy()
+    run_oracle(text, want)
+    run_engine(text, got)
+    shape = (opcodes.THREADS // opcodes.BLOCK, len(forms), -1)
+    count = opcodes.THREADS // opcodes.BLOCK * len(forms) * opcodes.CELLS * opcodes.CELL_BYTES // 8
+    cells = [array[:count].reshape(shape) for array in (got[3], want[3], start)]
+    for number, form in enumerate(forms):
+        assert opcodes.same_values(form, got[1][number], want[1][number]), form
+        assert opcodes.same_values(form, cells[0][:, number], cells[1][:, number]), form
+        assert not np.array_equal(cells[1][:, number], cells[2][:, number]), f"{form} changed nothing"
+
+
+def test_operations_across_lanes():
+    forms = opcodes.warp_forms()
+    data = np.random.default_rng(8).integers(0, 1 << 64, (len(forms), opcodes.SLOTS, opcodes.THREADS), dtype=np.uint64)
+    text = opcodes.warp_kernel(forms)
+    want = opcodes.launch_arguments(data, 4, opcodes.PLANES)
+    run_oracle(text, want)
+    executing = np.repeat(want[2], 32)
+    for width in (8, 16, 32):
+        got = opcodes.launch_arguments(data, 4, opcodes.PLANES)
+        run_engine(text, got, width)
+        for number, form in enumerate(forms):
+            known = np.ones(opcodes.THREADS, dtype=bool)
+            if form.startswith("shfl"):
+                source = want[1][number, 2]
+                known = (executing >> (source & 31).astype(np.uint32) & 1).astype(bool)
+                known |= ~(executing >> (np.arange(opcodes.THREADS) % 32).astype(np.uint32) & 1).astype(bool)
+            for plane in range(3):
+                usable = known | (plane > 0)
+                np.testing.assert_array_equal(
+                    got[1][number, plane][usable], want[1][number, plane][usable], err_msg=f"{form} {plane} {width}"
+                )

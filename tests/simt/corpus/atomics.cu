@@ -18,7 +18,7 @@ KERNEL(atomics_global_integer) {
     atomicXor(o + 45, a); atomicMin((s64*)o + 46, (s64)a); atomicMax((s64*)o + 47, (s64)a);
     o[48 + t] = atomicExch(o + 200 + t, a) + atomicExch(w + 200 + 2 * t + 400, x);
     o[400 + t] = atomicCAS(o + 600 + t, 0ull, a) + distinct<u64>(o + 600, t) + distinct<u32>((u32*)o + 1600, t);
-    u32 old = w[16], seen;
+    u32 old = atomicOr(w + 16, 0), seen;
     do { seen = old; old = atomicCAS(w + 16, seen, seen + (x & 255)); } while (old != seen);
 }
 
@@ -36,7 +36,7 @@ KERNEL(atomics_shared_integer) {
     atomicAdd(v, a); atomicMin(v + 1, a); atomicMax(v + 2, a); atomicAnd(v + 3, a); atomicOr(v + 4, a);
     atomicXor(v + 5, a); atomicMin((s64*)v + 6, (s64)a); atomicMax((s64*)v + 7, (s64)a);
     atomicCAS(v + 8, 72ull, 1ull); atomicCAS(w + 16, 112u, 2u); atomicExch(v + 9, 3ull);
-    u32 old = w[17], seen;
+    u32 old = atomicOr(w + 17, 0), seen;
     do { seen = old; old = atomicCAS(w + 17, seen, seen + (x & 255)); } while (old != seen);
     __syncthreads();
     if (t < 32) { uout[i * ROOM] = w[t]; uout[i * ROOM + 1] = v[t]; }
@@ -44,7 +44,7 @@ KERNEL(atomics_shared_integer) {
 
 __device__ void add_f64(double* place, double value) {  // the compare-and-swap form for architectures before sm_60
     u64* bits = (u64*)place;
-    u64 old = *bits, seen;
+    u64 old = atomicCAS(bits, 0, 0), seen;
     do {
         seen = old;
         old = atomicCAS(bits, seen, __double_as_longlong(value + __longlong_as_double(seen)));
@@ -80,12 +80,13 @@ KERNEL(atomics_float) {
 KERNEL(atomics_half_words) {
     int i = thread_index(), t = threadIdx.x;
     u16* h = (u16*)(uout + (i - t) * ROOM);
-    u16 old = h[t & 7], seen;
+    const u16 none = 0;
+    u16 old = atomicCAS(h + (t & 7), none, none), seen;
     do { seen = old; old = atomicCAS(h + (t & 7), seen, (u16)(seen + 1)); } while (old != seen);
     __shared__ u16 w[16];
     if (t < 16) w[t] = 0;
     __syncthreads();
-    old = w[t & 3];
+    old = atomicCAS(w + (t & 3), none, none);
     do { seen = old; old = atomicCAS(w + (t & 3), seen, (u16)(seen + 1)); } while (old != seen);
     __syncthreads();
     if (t < 4) h[100 + t] = w[t];

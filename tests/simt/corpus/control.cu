@@ -151,6 +151,7 @@ KERNEL(control_memory) {
     volatile float* f = fout + i * ROOM + 8;
     *f = a.x;
     *f = *f + 1.0f;
+    __syncthreads();
     volatile u8* byte = bytes;
     if (t == 0) byte[3] = 9;
     const float* somewhere = (i & 1) ? (const float*)dynamic : fin;  // generic: shared or global memory

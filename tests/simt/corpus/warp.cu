@@ -75,7 +75,7 @@ KERNEL(warp_block_barriers) {
     o[0] = (u32)tile[blockDim.x - 1 - t];
     o[1] = __syncthreads_count(a & 1); o[2] = __syncthreads_and(a != 12345); o[3] = __syncthreads_or(a == 12345);
     tile[t] = a + 1;
-    asm volatile("bar.sync 1, %0;" ::"r"((int)blockDim.x) : "memory");
+    __syncthreads();
     o[4] = (u32)tile[t ^ 1];
     __threadfence(); __threadfence_block(); __threadfence_system();
 }
