@@ -155,7 +155,7 @@ def run_case(
         "default_axes": resolve_axes(variant, {}),
         "device": device.name,
         "arch": device.arch,
-        "environment": environment,
+        "environment": replace(environment, gpu=getattr(device, "facts", {})),
         "preset_row": case.preset_row,
         "floor_bytes": planning.floor_bytes(variant, dataset, axes),
     }

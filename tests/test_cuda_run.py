@@ -46,6 +46,8 @@ def test_records_hold_event_times_of_every_step(gpu: FakeGpu, tmp_path: Path) ->
     assert {"binning", "scan", "sort_deep", "active_list", "grid_clear"} <= steps.keys()
     assert steps["sort_deep"] is not None
     assert steps["sort_deep"].median == pytest.approx(0.001)
+    assert record.environment.gpu["name"] == "Fake GPU"
+    assert record.environment.gpu["nvrtc"] == "12.9"
     assert record.kernel_info["p2g_block_sync"]["registers"] == 32
     assert json.loads((tmp_path / "records.jsonl").read_text().splitlines()[0])
     report = (tmp_path / "report.md").read_text()
