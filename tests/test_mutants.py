@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import re
 import shutil
 import tomllib
 from pathlib import Path
@@ -10,9 +12,11 @@ import pytest
 from transfers import crowded, transfer
 
 from mpmbench import device as devices
-from mpmbench import kernel, variants
+from mpmbench import discovery, kernel, preprocess
 from mpmbench.awkward import awkward_datasets
-from mpmbench.variants import get
+from mpmbench.kernel import load_source
+from mpmbench.variants import discover, get
+from mpmbench.workspace import NEUTRAL
 
 MUTANTS = tomllib.loads((Path(__file__).parent / "mutants" / "mutants.toml").read_text())
 MARGIN = 10  # how many times its allowance a wrong result must miss, so that a looser check would still refuse it
@@ -51,7 +55,7 @@ def test_mutant_is_refused(name: str, modes, tmp_path: Path, monkeypatch) -> Non
     mutant = MUTANTS[name]
     sources = mutated_sources(mutant, tmp_path)
     monkeypatch.setattr(kernel, "RAW_KERNELS", sources)
-    monkeypatch.setattr(variants, "RAW_KERNELS", sources)
+    monkeypatch.setattr(discovery, "RAW_KERNELS", sources)
     check, findings = run(mutant, modes)
     if mutant["refused_by"] == "finding":
         assert mutant["kind"] in {finding.kind for finding in findings}
@@ -73,5 +77,8 @@ def test_unbroken_origin_passes(mutant: dict, modes) -> None:
     assert not findings
 
 
-def test_every_kernel_file_has_been_broken() -> None:
-    assert {mutant["file"] for mutant in MUTANTS.values()} == {path.name for path in kernel.RAW_KERNELS.iterdir()}
+def test_every_file_of_a_transfer_has_been_broken() -> None:
+    helpers = re.findall(r'helper\(\s*"(\w+)"', inspect.getsource(preprocess))
+    texts = [load_source(stem, NEUTRAL).text for stem in {*helpers, *(variant.kernel for variant in discover())}]
+    files = {file for text in texts for file in re.findall(r'^#line \d+ "(.*)"$', text, re.M)}
+    assert {mutant["file"] for mutant in MUTANTS.values()} == files
