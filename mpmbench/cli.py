@@ -486,7 +486,9 @@ def _write_reports(records: list[Any], html: Path | None, md: Path | None, csv: 
 
 
 def _summarise(records: list[Any], written: Sequence[Path]) -> None:
-    """One line of verdict, the problems, the files; exit code 4 where a result is wrong."""
+    """The problems, the report's own answer, the files; exit code 4 where a result is wrong."""
+    from mpmbench.report import document
+
     by_status: dict[str, int] = {}
     for record in records:
         by_status[record.status] = by_status.get(record.status, 0) + 1
@@ -497,6 +499,11 @@ def _summarise(records: list[Any], written: Sequence[Path]) -> None:
             notes.print(
                 f"{record.status}: {record.variant} on {record.dataset.name}: {detail}", markup=False, soft_wrap=True
             )
+    if records:
+        answer = document.build(records)
+        console.print(answer.verdict, markup=False, soft_wrap=True, style="bold")
+        for line in answer.answer:
+            console.print(f"  {line}", markup=False, soft_wrap=True)
     counted = ", ".join(f"{count} {status}" for status, count in sorted(by_status.items()))
     console.print(f"{len(records)} rows: {counted}")
     for path in written:
