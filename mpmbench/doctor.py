@@ -170,6 +170,17 @@ def cupy() -> list[Check]:
     return [Check("CuPy", "ok", found[0])]
 
 
+def headers() -> list[Check]:
+    """CuPy compiles nothing without the CUDA runtime's headers, and its wheel does not bring them."""
+    if not any(map(_installed, CUPY)):
+        return []
+    pathfinder = importlib.import_module("cuda.pathfinder")
+    folder = pathfinder.find_nvidia_header_directory("cudart")
+    if folder is None:
+        return [Check("CUDA headers", "missing", "CuPy cannot compile kernels without them", INSTALL_CUPY)]
+    return [Check("CUDA headers", "ok", str(folder))]
+
+
 def gpu() -> list[Check]:
     """What CuPy sees: a GPU that kernels can be launched on."""
     from mpmbench.device.cuda import list_gpus
@@ -296,6 +307,7 @@ LOOKS: tuple[tuple[str, Callable[[], list[Check]]], ...] = (
     ("memory", memory),
     ("kernel cache", cache_and_disk),
     ("CuPy", cupy),
+    ("CUDA headers", headers),
     ("GPU", gpu),
     ("driver", driver),
 )

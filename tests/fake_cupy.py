@@ -126,9 +126,11 @@ class FakeGpu:
     compile_for_real: bool = True
     fail_launch: Exception | None = None
     fail_synchronize: Exception | None = None
+    fail_compile: Exception | None = None
     fail_count: Exception | None = None
     now: float = 0.0  # [s] on the device's timeline
     used: int = 0
+    pooled: int = 0  # bytes that CuPy's pool holds without using them
     streams: list[Any] = field(default_factory=list)  # the current one is last; empty: the default stream
     devices: list[int] = field(default_factory=lambda: [0])
 
@@ -238,14 +240,14 @@ def fake_cupy(gpu: FakeGpu) -> SimpleNamespace:
         def __init__(self, module: RawModule, name: str) -> None:
             self.module, self.name, self.dynamic_limit, self.ptx = module, name, 48 * 1024, ""
 
-        @follows("RawKernel.compile")
-        def compile(self) -> None:
-            assert gpu.devices, "no current device"
+        def load(self) -> None:
+            """What the real ``RawModule.get_function`` does before it returns a kernel."""
+            if gpu.fail_compile is not None:
+                raise gpu.fail_compile
             if gpu.compile_for_real:
                 self.ptx = compile_as_cupy_does(self.module.code, self.module.options, gpu.capability)
                 if f".entry {self.name}(" not in self.ptx:
                     raise cupy.cuda.runtime.CUDARuntimeError(500)  # named symbol not found
-            gpu.log("compile", self.name)
 
         @attribute("RawKernel.attributes")
         def attributes(self) -> dict[str, int]:
@@ -269,8 +271,6 @@ def fake_cupy(gpu: FakeGpu) -> SimpleNamespace:
             if gpu.fail_launch is not None:
                 raise gpu.fail_launch
             if gpu.execute is not None and self.name != "mpmbench_hold":
-                if not self.ptx:
-                    self.compile()
                 gpu.execute(self.ptx, self.name, grid, block, tuple(_by_value(a) for a in args), shared_mem)
             gpu.now += gpu.seconds.get(self.name, 1e-5)
             gpu.log("kernel", SimpleNamespace(name=self.name, grid=grid, block=block, args=args, shared=shared_mem,
@@ -296,7 +296,18 @@ def fake_cupy(gpu: FakeGpu) -> SimpleNamespace:
 
         @follows("RawModule.get_function")
         def get_function(self, name: str) -> RawKernel:
-            return RawKernel(self, name)
+            kernel = RawKernel(self, name)
+            kernel.load()
+            return kernel
+
+    class Pool:
+        @follows("cuda.MemoryPool.free_bytes")
+        def free_bytes(self) -> int:
+            return gpu.pooled
+
+    @follows("get_default_memory_pool")
+    def get_default_memory_pool() -> Pool:
+        return Pool()
 
     @follows("asarray")
     def asarray(a: np.ndarray, blocking: bool = False) -> Array:
@@ -346,17 +357,16 @@ def fake_cupy(gpu: FakeGpu) -> SimpleNamespace:
         asarray=asarray,
         asnumpy=asnumpy,
         empty=empty,
+        get_default_memory_pool=get_default_memory_pool,
         cuda=SimpleNamespace(
             Device=Device,
             Event=Event,
             Stream=Stream,
             get_elapsed_time=get_elapsed_time,
             compiler=SimpleNamespace(CompileException=cupy.cuda.compiler.CompileException),
-            driver=SimpleNamespace(CUDADriverError=cupy.cuda.driver.CUDADriverError),
             memory=SimpleNamespace(OutOfMemoryError=cupy.cuda.memory.OutOfMemoryError),
             nvrtc=SimpleNamespace(getVersion=nvrtc_get_version),
             runtime=SimpleNamespace(
-                CUDARuntimeError=cupy.cuda.runtime.CUDARuntimeError,
                 getDeviceCount=get_device_count,
                 getDeviceProperties=get_device_properties,
                 driverGetVersion=driver_get_version,

@@ -241,8 +241,32 @@ def test_source_that_does_not_compile(gpu: FakeGpu) -> None:
     text = '#line 7 "mine.cu"\nextern "C" __global__ void axpy() { undefined = 1; }\n'
     with pytest.raises(InputError, match=r"mine.cu\(7\).*undefined"):
         device.compile(source(text), "axpy")
-    with pytest.raises(InputError, match="cannot load kernel missing"):
+    with pytest.raises(InputError, match="cannot compile and load kernel missing"):
         device.compile(source(AXPY), "missing")
+
+
+@pytest.mark.parametrize(
+    "failure",
+    [
+        RuntimeError("Failed to find CUDA headers."),  # CuPy's own: pip brings them in a wheel apart
+        PermissionError("cannot write the kernel cache"),
+    ],
+)
+def test_cupy_that_cannot_compile(gpu: FakeGpu, failure: Exception) -> None:
+    gpu.fail_compile = failure
+    with pytest.raises(InputError, match=r"cannot compile and load kernel axpy.*mpmbench doctor"):
+        CudaDevice("cuda").compile(source(AXPY), "axpy")
+
+
+def test_errors_of_cuda_are_what_the_device_catches() -> None:
+    for error in (cupy.cuda.runtime.CUDARuntimeError, cupy.cuda.driver.CUDADriverError, cupy.cuda.nvrtc.NVRTCError):
+        assert issubclass(error, RuntimeError)
+
+
+def test_free_memory_counts_what_the_pool_holds_unused(gpu: FakeGpu) -> None:
+    device = CudaDevice("cuda")
+    gpu.pooled = 1000
+    assert device.free_bytes == gpu.memory_bytes + 1000
 
 
 def test_launch_failure_names_the_kernel(gpu: FakeGpu) -> None:

@@ -141,6 +141,14 @@ def test_no_cupy_and_two_cupys(monkeypatch: pytest.MonkeyPatch) -> None:
     assert doctor.cupy()[0].remedy == "pip install 'cupy-cuda12x==14.2.*'"
 
 
+def test_no_headers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cuda.pathfinder.find_nvidia_header_directory", lambda name: None)
+    (check,) = doctor.headers()
+    assert (check.status, check.remedy) == ("missing", doctor.INSTALL_CUPY)
+    installed(monkeypatch, cupy_cuda12x=None, cupy_cuda13x=None)
+    assert doctor.headers() == []
+
+
 def test_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     machine = FakeGpu()
     monkeypatch.setitem(sys.modules, "cupy", fake_cupy(machine))

@@ -72,10 +72,9 @@ class CudaDevice:
         index = _device_index(name)
         self._cupy = import_cupy()
         cuda = self._cupy.cuda
-        self._cuda_errors = (cuda.runtime.CUDARuntimeError, cuda.driver.CUDADriverError)
         try:
             count = cuda.runtime.getDeviceCount()
-        except self._cuda_errors as error:
+        except RuntimeError as error:
             raise InputError(f"no GPU for device {name!r} ({_one_line(error)}): {CURE_NO_GPU}") from error
         if count == 0:
             raise InputError(f"no GPU for device {name!r}: {CURE_NO_GPU}")
@@ -121,10 +120,10 @@ class CudaDevice:
 
     @property
     def free_bytes(self) -> int:
-        """Device memory that is free now [bytes]."""
-        with self._errors("cannot ask for the free memory"):
+        """Device memory that is free now [bytes], with what CuPy's pool holds without using it."""
+        with self._errors("cannot ask for the free memory"), self._current():
             free, _total = self._gpu.mem_info
-        return int(free)
+            return int(free) + int(self._cupy.get_default_memory_pool().free_bytes())
 
     def upload(self, host: np.ndarray) -> Any:
         with self._allocating(host.nbytes):
@@ -144,10 +143,9 @@ class CudaDevice:
     def compile(self, source: KernelSource, entry: str) -> CompiledKernel:
         compile_error = self._cupy.cuda.compiler.CompileException
         try:
-            with self._errors(f"cannot load kernel {entry} of {source.name}"), self._current():
+            with self._errors(f"cannot compile and load kernel {entry} of {source.name}"), self._current():
                 module = self._cupy.RawModule(code=source.text, options=cupy_options(COMPILE_OPTIONS))
-                kernel = module.get_function(entry)
-                kernel.compile()  # lazily it would land in the first sample
+                kernel = module.get_function(entry)  # compiles and loads: none of it may land in the first sample
         except compile_error as error:
             raise InputError(f"{source.name} does not compile for {self.arch}: {_first_error(str(error))}") from error
         return CompiledKernel(source, entry, kernel)
@@ -187,7 +185,7 @@ class CudaDevice:
         size = 2 * int(self.properties["l2CacheSize"])
         if self._flush_buffer is None:
             self._flush_buffer = self.empty(size, np.uint8)
-        with self._errors("cannot flush the cache"):
+        with self._errors("cannot flush the cache"), self._current():
             self._flush_buffer.data.memset_async(0, size, stream=self._stream)
 
     def hold(self, seconds: float) -> None:
@@ -219,7 +217,7 @@ class CudaDevice:
     def _errors(self, what: str, cure: str = "see `mpmbench doctor`") -> Iterator[None]:
         try:
             yield
-        except self._cuda_errors as error:
+        except (RuntimeError, OSError) as error:  # CuPy's errors, of CUDA and its own, are RuntimeErrors
             raise InputError(f"{self.name}: {what}: {_one_line(error)}; {cure}") from error
 
     @contextmanager
