@@ -75,9 +75,9 @@ def run(
     return launch.run(_dim3(grid), np.random.default_rng(seed) if seed is not None else None, budget)
 
 
-def check_supported(kernel: Kernel) -> None:
+def check_supported(kernel: Kernel, module: Module) -> None:
     """Raise InputError for the first instruction that this executor does not know."""
-    decoder = _Decoder(kernel, {}, 0)
+    decoder = _Decoder(kernel, memory.module_variables(module), 0)
     for item in kernel.instructions:
         decoder.step(item)
 

@@ -3,11 +3,12 @@ that are empty, full, one lane and random."""
 
 from __future__ import annotations
 
+import corpus_kernels as corpus
 import numpy as np
 import opcode_kernels as opcodes
 import pytest
 
-from mpmbench.simt import engine, numpy_exec, ptx
+from mpmbench.simt import codegen, engine, numpy_exec, ptx
 
 BATCH = 24
 SHAPE = ((opcodes.THREADS // opcodes.BLOCK,), (opcodes.BLOCK,))
@@ -102,3 +103,54 @@ def test_operations_across_lanes():
                 np.testing.assert_array_equal(
                     got[1][number, plane][usable], want[1][number, plane][usable], err_msg=f"{form} {plane} {width}"
                 )
+
+
+# --- whole kernels ----------------------------------------------------------------------------------------------------
+
+
+def corpus_kernels() -> list:
+    """Every kernel of the corpus for the newest architecture; the lane width goes round. structures have a test of
+    their own with the oracle."""
+    names = [
+        (stem, name)
+        for stem in corpus.FILES
+        for name in corpus.module(stem, "sm_90").kernels
+        if "structures" not in name
+    ]
+    return [pytest.param(stem, name, (16, 8, 32)[n % 3], id=name) for n, (stem, name) in enumerate(names)]
+
+
+@pytest.mark.parametrize(("stem", "name", "lane_width"), corpus_kernels())
+def test_kernels_of_the_corpus(stem, name, lane_width):
+    """Results and, where no approximate function decides a branch, counters."""
+    module, approximate = corpus.module(stem, "sm_90"), name.startswith("approx")
+    # NaNs differ in sign and payload, which integer operations on float bits can see.
+    tame = approximate or name == "float32_plain"
+    want, got = corpus.arguments(128, tame=tame), corpus.arguments(128, tame=tame)
+    result = numpy_exec.run(module.kernels[name], module, (2,), (64,), want, 4096)
+    compiled = engine.compile_ptx(corpus.ptx_text(stem, "sm_90"), "count", lane_width)
+    launched = compiled.kernel(name).launch((2,), (64,), got, 4096)
+    assert launched.findings == result.findings == ()
+    for a, b in zip(got[3:], want[3:], strict=True):
+        if approximate and a.dtype.kind == "f":
+            np.testing.assert_allclose(a, b, rtol=1e-5 if a.dtype == np.float32 else 1e-12)
+        else:
+            np.testing.assert_array_equal(a, b)
+    if name != "approx_svd":
+        assert launched.counters == result.counters
+
+
+def test_every_form_is_known_to_both_executors():
+    """The opcode set is closed: each form in the corpus on three architectures, and in every kernel that ships."""
+    known: set[str] = set()
+    for arch in corpus.ARCHS:
+        for stem in corpus.FILES:
+            module = corpus.module(stem, arch)
+            numbers = {name: number for number, name in enumerate(module.variables)}
+            for kernel in module.kernels.values():
+                numpy_exec.check_supported(kernel, module)
+                codegen.generate(kernel, numbers, "run", 16)
+                known.update(corpus.form(item) for item in kernel.instructions)
+    print(f"{len(known)} forms in the corpus")
+    assert len(known) > 500
+    assert known == set(corpus.forms())
