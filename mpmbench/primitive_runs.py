@@ -101,7 +101,10 @@ def run_primitive(
     if not 0 <= size < INT32_LIMIT:
         raise InputError(f"size {size} is out of range: kernels count {operation.unit} from 0 to 2^31 - 1")
     begin = time.perf_counter()
-    inputs = operation.inputs(axes, size, seed)
+    reason = why_impossible(primitive, axes)
+    if device.name.partition(":")[0] not in primitive.devices:
+        reason = f"runs on {' and '.join(primitive.devices)} only"
+    inputs = {} if reason else operation.inputs(axes, size, seed)
     about: dict[str, Any] = {
         "variant": primitive.name,
         "variant_summary": primitive.summary,
@@ -113,12 +116,10 @@ def run_primitive(
         "arch": device.arch,
         "environment": environment,
         "preset_row": preset_row,
-        "floor_bytes": operation.floor(axes, size),
     }
-    if device.name.partition(":")[0] not in primitive.devices:
-        return Record(**about, skipped_because=f"runs on {' and '.join(primitive.devices)} only")
-    if reason := why_impossible(primitive, axes):
+    if reason:
         return Record(**about, skipped_because=reason)
+    about["floor_bytes"] = operation.floor(axes, size)
     if (least := about["floor_bytes"]) > (free := free_bytes(device)):
         return Record(
             **about, skipped_because=f"needs {least / 2**30:.2f} GiB, {device.name} has {free / 2**30:.2f} free"

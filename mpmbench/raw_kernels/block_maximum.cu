@@ -1,6 +1,7 @@
 // The largest particle count of a bin, per block. A warp owns one block: its lanes stride over the cells, then reduce.
 // Constants: HALO, 1 to include the bins that a pull reads around the block.
 #include "block.cuh"
+#include "operators.cuh"
 
 extern "C" __global__ void block_maximum(
     const Domain domain, const int block_count, const int* __restrict__ bin_start, int* __restrict__ maximum) {
@@ -21,7 +22,6 @@ extern "C" __global__ void block_maximum(
         const int z = block.first.z - BELOW + i / (EDGE_X * EDGE_Y);
         largest = max(largest, bin_of(domain, bin_start, x, y, z).count);
     }
-    __syncwarp();
 #pragma unroll
     for (int reach = WARP / 2; reach > 0; reach /= 2) {
         largest = max(largest, __shfl_xor_sync(0xffffffffu, largest, reach));
