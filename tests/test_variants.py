@@ -81,6 +81,15 @@ def test_pairwise_axes(device, row: dict) -> None:
     assert check.passed, str(check)
 
 
+@pytest.mark.parametrize("block_shape", [(1, 1, 1), (2, 3, 7), (33, 1, 1)], ids=str)
+@pytest.mark.parametrize("name", BLOCK_VARIANTS)
+def test_any_block_shape(device, name: str, block_shape: tuple[int, int, int]) -> None:
+    """One cell, no multiple of a warp, one thread more than a warp."""
+    axes = {"spline": "linear", "writing": "literal", "cell_index": "block", "batching": 2}
+    check, _, _ = transfer(get(name), crowded(), device, block_shape=block_shape, **axes)
+    assert check.passed, str(check)
+
+
 def test_covering_array_covers_every_possible_pair() -> None:
     covered = set().union(*map(pairs_of, covering_array()))
     for variant in VARIANTS:
