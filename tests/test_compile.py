@@ -18,9 +18,9 @@ from pairwise import covering_rows
 
 from mpmbench.dataset import Dataset
 from mpmbench.device import CompiledKernel, KernelInfo
-from mpmbench.device.ptxas import assemble, kernel_infos, parse_log
+from mpmbench.device.ptxas import assemble, kernel_infos, parse_log, source_infos
 from mpmbench.errors import InputError
-from mpmbench.kernel import KernelSource, compile_options, load_source
+from mpmbench.kernel import KernelSource, load_source
 from mpmbench.plan import build_plan
 from mpmbench.reference import Nodes
 from mpmbench.simt import cache as disk_cache
@@ -74,8 +74,7 @@ def kernels_of(variant: Variant, axes: dict[str, Any]) -> dict[str, Kernel]:
 def compiled(kernel: Kernel, arch: str) -> KernelInfo:
     source, entry = kernel
     try:
-        ptx = compile_cuda(source.text, arch, compile_options(arch), f"{source.name}.cu")
-        return kernel_infos(ptx, arch)[entry]
+        return source_infos(source, arch)[entry]
     except InputError as error:
         constants = " ".join(f"{name}={value}" for name, value in source.constants)
         raise InputError(f"{error} [{entry} for {arch}: {constants}]") from error

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from fake_cupy import FakeGpu, compile_as_cupy_does, documented_signature, fake_cupy
 
-from mpmbench.device import Launch, open_device
+from mpmbench.device import KernelInfo, Launch, open_device
 from mpmbench.device.cuda import HOLD_SOURCE, CudaDevice, cupy_options, list_gpus
 from mpmbench.device.ptxas import kernel_infos
 from mpmbench.errors import InputError
@@ -154,6 +154,18 @@ def test_facts_for_the_record(gpu: FakeGpu) -> None:
     assert facts["arch"] == "sm_90"
     assert facts["nvrtc"] == "12.9"
     json.dumps(facts)
+
+
+def test_kernel_info(gpu: FakeGpu, monkeypatch: pytest.MonkeyPatch) -> None:
+    device = CudaDevice("cuda")
+    kernel = device.compile(source(AXPY), "axpy")
+    assert device.info(kernel) == KernelInfo("sm_90", 32, 32, 32, spill_bytes=0)
+
+    def missing(*_):
+        raise InputError("no ptxas")
+
+    monkeypatch.setattr("mpmbench.device.cuda.source_infos", missing)
+    assert device.info(kernel).spill_bytes is None
 
 
 def test_large_shared_memory_is_asked_for_once(gpu: FakeGpu) -> None:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from mpmbench.device import CompiledKernel, KernelInfo, Launch, LaunchReport
+from mpmbench.device.ptxas import source_infos
 from mpmbench.errors import InputError
 from mpmbench.kernel import COMPILE_OPTIONS, KernelSource
 
@@ -151,14 +152,20 @@ class CudaDevice:
         return CompiledKernel(source, entry, kernel)
 
     def info(self, kernel: CompiledKernel) -> KernelInfo:
-        """What the driver says of the loaded kernel. It counts spills as local memory, so ``spill_bytes`` is None."""
+        """What the driver says of the loaded kernel. It counts spills as local memory: how many they are says
+        ``ptxas``, where it is installed and knows this GPU; else ``spill_bytes`` is None."""
         with self._errors(f"cannot ask for the attributes of {kernel.entry}"), self._current():
             attributes = kernel.handle.attributes
+        try:
+            spill_bytes = source_infos(kernel.source, self.arch)[kernel.entry].spill_bytes
+        except InputError:
+            spill_bytes = None
         return KernelInfo(
             arch=self.arch,
             registers=attributes["num_regs"],
             shared_bytes=attributes["shared_size_bytes"],
             local_bytes=attributes["local_size_bytes"],
+            spill_bytes=spill_bytes,
         )
 
     def launch(self, launch: Launch) -> LaunchReport:

@@ -18,7 +18,9 @@ from pathlib import Path
 
 from mpmbench.device import KernelInfo
 from mpmbench.errors import InputError
+from mpmbench.kernel import COMPILE_OPTIONS, KernelSource
 from mpmbench.simt import cache
+from mpmbench.simt.nvrtc import compile_cuda
 
 CURE = "pip install 'nvidia-cuda-nvcc-cu12==12.9.*'"
 
@@ -60,6 +62,11 @@ def kernel_infos(ptx: str, arch: str) -> dict[str, KernelInfo]:
     infos = parse_log(assemble(ptx, arch), arch)
     cache.store("ptxas", key, json.dumps({entry: asdict(info) for entry, info in infos.items()}).encode())
     return infos
+
+
+def source_infos(source: KernelSource, arch: str) -> dict[str, KernelInfo]:
+    """The same for a kernel source: NVRTC to PTX, then ``ptxas``."""
+    return kernel_infos(compile_cuda(source.text, arch, COMPILE_OPTIONS, f"{source.name}.cu"), arch)
 
 
 def assemble(ptx: str, arch: str) -> str:
