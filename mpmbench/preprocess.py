@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mpmbench.device import Launch
-from mpmbench.workspace import SCAN_SEGMENT, Step, Workspace, bin_count, maximum_needed, scan_levels
+from mpmbench.primitives.scan_lookback import lookback
+from mpmbench.workspace import Step, Workspace, bin_count, maximum_needed
 
 _REAL = ("REAL", "REAL_IS_DOUBLE")
 _PARTICLES = (*_REAL, "APIC", "SOA")
@@ -63,31 +63,7 @@ def binning(work: Workspace) -> Step:
 def bin_scan(work: Workspace) -> Step:
     """Counts of bins to the first sorted particle of each."""
     bins = bin_count(work.grid, work.axes) + 1
-    return Step("scan", scan_launches(work, "bin_scan", bins, work.buffers["bin_count"], work.bin_start, flags=False))
-
-
-def scan_launches(
-    work: Workspace, prefix: str, count: int, values: object, scanned: object, flags: bool
-) -> tuple[Launch, ...]:
-    """Exclusive scan of any length: segments, then the segment sums one level up, then both together."""
-    levels = scan_levels(count)
-    lengths, inputs, outputs = [count], [values], [scanned]
-    for level, length in enumerate(levels[:-1]):
-        lengths.append(length)
-        inputs.append(work.buffers[f"{prefix}_sums_{level}"])
-        outputs.append(work.buffers[f"{prefix}_scanned_{level}"])
-    launches: list[Launch] = []
-    for level, (length, source, result) in enumerate(zip(lengths, inputs, outputs, strict=True)):
-        kernel = work.helper("scan_segments", SCAN_FLAGS=flags and level == 0)
-        sums = work.buffers[f"{prefix}_sums_{level}"]
-        segments = -(-length // SCAN_SEGMENT)
-        launches += work.thread_blocks(
-            segments, SCAN_SEGMENT // 4, np.int32(length), source, result, sums, kernel=kernel
-        )
-    for level in reversed(range(len(lengths) - 1)):
-        add = work.helper("scan_add")
-        launches += work.cover(lengths[level], np.int32(lengths[level]), outputs[level], outputs[level + 1], kernel=add)
-    return tuple(launches)
+    return Step("scan", lookback(work, bins, work.buffers["bin_count"], work.bin_start, work.buffers["bin_scan"]))
 
 
 def sort(work: Workspace) -> Step:
@@ -116,7 +92,7 @@ def block_maximum(work: Workspace) -> Step:
 def active_list(work: Workspace) -> Step:
     """Stream compaction of the blocks whose maximum is not zero; the list's length is read back once."""
     blocks, slots = _block_count(work), work.buffers["block_slots"]
-    scan = scan_launches(work, "block_scan", blocks, work.block_maximum, slots, flags=True)
+    scan = lookback(work, blocks, work.block_maximum, slots, work.buffers["block_scan"], flags=True)
     length = work.buffers["active_count"]
     compact = work.cover(
         blocks, np.int32(blocks), work.block_maximum, slots, work.active_blocks, length,

@@ -13,9 +13,8 @@ from mpmbench.device import CompiledKernel, Device, Launch
 from mpmbench.errors import InputError, MpmbenchError
 from mpmbench.grid import Grid
 from mpmbench.launcher import INT32_LIMIT, THREADS, Launcher
+from mpmbench.primitives.scan_lookback import state_length
 from mpmbench.variants import ATTRIBUTES, AXES, RESULTS, Variant
-
-SCAN_SEGMENT = 1024  # values that one thread block of scan_segments.cu scans
 
 BufferTable = dict[str, tuple[tuple[int, ...], np.dtype]]
 
@@ -62,15 +61,6 @@ def domain_type(dtype: Any) -> np.dtype:
     )
 
 
-def scan_levels(count: int) -> list[int]:
-    """Lengths of the levels above a scan of ``count`` values: segment sums, sums of those, ... down to one."""
-    levels = []
-    while count > 1:
-        count = -(-count // SCAN_SEGMENT)
-        levels.append(count)
-    return levels or [1]
-
-
 def bin_count(grid: Grid, axes: Mapping[str, Any]) -> int:
     """Bins of a grid; blocks that reach past it are numbered in full."""
     if axes["cell_index"] == "global":
@@ -104,7 +94,7 @@ def buffer_table(variant: Variant, grid: Grid, particles: int, axes: Mapping[str
         bins = bin_count(grid, axes) + 1
         table["bin_count"] = table["bin_start"] = ((bins,), integer)
         table["tickets"] = ((n, 2), integer)
-        table |= _scan_table("bin_scan", bins)
+        table["bin_scan"] = ((state_length(bins),), integer)
     if order == "deep":
         table["sorted_particles"] = table["particles"]
         if variant.transfer == "g2p":
@@ -117,14 +107,7 @@ def buffer_table(variant: Variant, grid: Grid, particles: int, axes: Mapping[str
         if active:
             table["block_slots"] = ((blocks,), integer)
             table["active_count"] = ((1,), integer)
-            table |= _scan_table("block_scan", blocks)
-    return table
-
-
-def _scan_table(prefix: str, count: int) -> BufferTable:
-    table: BufferTable = {}
-    for level, length in enumerate(scan_levels(count)):
-        table[f"{prefix}_sums_{level}"] = table[f"{prefix}_scanned_{level}"] = ((length,), np.dtype(np.int32))
+            table["block_scan"] = ((state_length(blocks),), integer)
     return table
 
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from mpmbench import device as devices
-from mpmbench import preprocess
 from mpmbench.dataset import Dataset
 from mpmbench.plan import build_plan
+from mpmbench.primitives.scan_lookback import lookback, state_length
 from mpmbench.reference import Nodes
 from mpmbench.spline import get_spline
 from mpmbench.variants import get, resolve_axes
-from mpmbench.workspace import Workspace, bin_count, scan_levels
+from mpmbench.workspace import Workspace, bin_count
 
 SHAPE = (11, 9, 13)  # no multiple of any block edge used here
 SEED = 20261
@@ -100,22 +100,15 @@ def test_sort_runs_again_on_the_same_buffers(device) -> None:
 
 
 @pytest.mark.parametrize("flags", [False, True], ids=["values", "flags"])
-@pytest.mark.parametrize("count", [1, 2, 1023, 1024, 1025, 3 * 1024, 1024 * 1024 + 1])
+@pytest.mark.parametrize("count", [1, 2, 4095, 4096, 4097, 40 * 4096 + 1])
 def test_scan_of_any_length(device, count: int, flags: bool) -> None:
-    if count > 10**6 and flags:
-        pytest.skip("three levels once")
     work = plan_of(device, "p2g_global_atomic").work
-    rng = np.random.default_rng(SEED)
-    values = rng.integers(0, 3, count).astype(np.int32)
-    work.buffers["out"] = device.empty((count,), np.int32)
-    for level, length in enumerate(scan_levels(count)):
-        for part in ("sums", "scanned"):
-            work.buffers[f"test_{part}_{level}"] = device.empty((length,), np.int32)
-    source = device.upload(values)
-    for launch in preprocess.scan_launches(work, "test", count, source, work.buffers["out"], flags=flags):
+    values = np.random.default_rng(SEED).integers(0, 3, count).astype(np.int32)
+    out, state = device.empty((count,), np.int32), device.empty((state_length(count),), np.int32)
+    for launch in lookback(work, count, device.upload(values), out, state, flags=flags):
         device.launch(launch)
     expected = (values > 0) if flags else values
-    np.testing.assert_array_equal(fetch(work, "out"), np.cumsum(expected) - expected)
+    np.testing.assert_array_equal(device.download(out), np.cumsum(expected) - expected)
 
 
 @pytest.mark.parametrize("cell_index", ["global", "block"])

@@ -2,8 +2,8 @@
 
 The unary operator turns what is loaded into a value, the binary one combines two values; both are constants of the
 kernels. What the method needs of it: the CFL bound (``length_max`` over velocities, eq. 92; ``speed_max`` over
-particles with their affine part, eq. 93), what transfers conserve (``momentum_add``: mass and momentum in one pass, eqs.
-144, 145), and the fullest bin (``identity_max``).
+particles with their affine part, eq. 93), what transfers conserve (``momentum_add``: mass and momentum in one pass,
+eqs. 144 and 145), and the fullest bin (``identity_max``).
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from mpmbench.check import CheckResult
+from mpmbench.device import Launch
 from mpmbench.discovery import Axes
 from mpmbench.primitives import Arrays, Bench, Built, Operation
 
@@ -87,7 +88,7 @@ def check(inputs: Arrays, outputs: Arrays, axes: Axes) -> CheckResult:
     columns = values.reshape(len(values), -1).T
     if axes["element"] == "int":
         neutral = 0 if binary == "add" else np.iinfo(np.int32).min
-        reference = [int(c.sum()) if binary == "add" else int(c.max(initial=neutral)) for c in columns]
+        reference = [float(c.sum() if binary == "add" else c.max(initial=neutral)) for c in columns]
         allowed = [0.0]
     else:
         u = float(np.finfo(number_type(axes["element"])).eps) / 2
@@ -123,7 +124,7 @@ def pyramid(bench: Bench) -> Built:
     above = element_constants(value_element(axes)) | {"UNARY": "Identity"}
     count, source = bench.size, bench.upload(bench.inputs["values"])
     width, dtype = components(value_element(axes)), number_type(axes["element"])
-    launches = []
+    launches: list[Launch] = []
     while True:
         partials = max(1, -(-count // (group * loads)))
         result = bench.empty((partials, width), dtype)
