@@ -114,7 +114,7 @@ def run_primitive(
         "default_axes": resolve_axes(primitive, {}),
         "device": device.name,
         "arch": device.arch,
-        "environment": environment,
+        "environment": replace(environment, gpu=getattr(device, "facts", {})),
         "preset_row": preset_row,
     }
     if reason:

@@ -16,12 +16,15 @@ import numpy as np
 import pytest
 from pairwise import covering_rows
 
+from mpmbench import primitives
 from mpmbench.dataset import Dataset
 from mpmbench.device import CompiledKernel, KernelInfo
 from mpmbench.device.ptxas import assemble, kernel_infos, parse_log, source_infos
 from mpmbench.errors import InputError
 from mpmbench.kernel import KernelSource, load_source
 from mpmbench.plan import build_plan
+from mpmbench.primitive_runs import build_primitive
+from mpmbench.primitives import Primitive
 from mpmbench.reference import Nodes
 from mpmbench.simt import cache as disk_cache
 from mpmbench.simt.nvrtc import compile_cuda
@@ -31,6 +34,7 @@ from mpmbench.workspace import kernel_constants
 MAIN_ARCHS = ("sm_52", "sm_90")  # the GPU of the thesis and a current one: every axis
 ARCHS = ("sm_52", "sm_70", "sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")  # default axes
 VARIANTS = {variant.name: variant for variant in discover()}
+PRIMITIVES = {primitive.name: primitive for primitive in primitives.discover()}
 
 Kernel = tuple[KernelSource, str]  # with the name of its function
 
@@ -52,6 +56,15 @@ class CompileOnlyDevice:
     def compile(self, source: KernelSource, entry: str) -> CompiledKernel:
         self.kernels[f"{source.sha256} {entry}"] = source, entry
         return CompiledKernel(source, entry, None)
+
+
+def kernels_of_primitive(primitive: Primitive, axes: dict[str, Any]) -> dict[str, Kernel]:
+    """The same for a primitive."""
+    device = CompileOnlyDevice()
+    inputs = primitive.operation.inputs(axes, 5000, 1)
+    built = build_primitive(primitive, device, axes, inputs, 5000)  # type: ignore[arg-type]
+    assert built.launches
+    return device.kernels
 
 
 @cache
@@ -116,6 +129,24 @@ def test_default_axes_compile_for_every_gpu_and_do_not_spill(name: str, record_p
         assert info.spill_bytes == 0, f"{entry} of {source.name} spills {info.spill_bytes} B for {info.arch}"
         assert info.registers is not None
         assert 0 < info.registers <= 255
+
+
+@pytest.mark.parametrize("name", PRIMITIVES)
+def test_default_axes_of_primitives_compile_for_every_gpu_and_do_not_spill(name: str, record_property) -> None:
+    kernels = kernels_of_primitive(PRIMITIVES[name], primitives.resolve_axes(PRIMITIVES[name], {}))
+    results = compile_all((kernel, arch) for kernel in kernels.values() for arch in ARCHS)
+    report_spills(results, record_property)
+    assert all(info.spill_bytes == 0 for _, info in results)
+
+
+@pytest.mark.parametrize("name", PRIMITIVES)
+def test_every_pair_of_axis_values_of_primitives_compiles(name: str, record_property) -> None:
+    primitive = PRIMITIVES[name]
+    rows = covering_rows([primitive.axes], lambda axes: primitives.why_impossible(primitive, axes) is None, seed=7)
+    kernels: dict[str, Kernel] = {}
+    for axes in rows:
+        kernels |= kernels_of_primitive(primitive, axes)
+    report_spills(compile_all((k, arch) for k in kernels.values() for arch in MAIN_ARCHS), record_property)
 
 
 @pytest.mark.parametrize("name", VARIANTS)
