@@ -312,7 +312,7 @@ class _Parser:
                 continue
             else:
                 self._module_variable(statement)
-        kernels = {f.name: _inline(f, self.functions) for f in self.functions.values() if f.is_kernel}
+        kernels = {f.name: _inline(f, self) for f in self.functions.values() if f.is_kernel}
         return Module(kernels, self.variables, self.target)
 
     def _skip_scope(self) -> None:
@@ -429,14 +429,13 @@ class _Parser:
             return function.symbols[name]
         if name in self.variables:
             return Symbol(name, self.variables[name].space)
+        # Where these lie is known only when a kernel and all it calls are together: see _place_shared.
         if name in self.module_shared:
-            align, size = self.module_shared[name]
-            offset = _align(function.shared_bytes, align)
-            function.shared_bytes = offset + size
-            return function.symbols.setdefault(name, Symbol(name, "shared", offset))
+            return Symbol(name, MODULE_SHARED)
         if name in self.extern_shared:
-            # Offset -1 marks "after all static shared memory", which is known only when the kernel is complete.
-            return Symbol(name, "shared", -1)
+            return Symbol(name, DYNAMIC_SHARED)
+        if name in self.functions:
+            raise InputError(f"PTX: the address of function {name} is taken in {function.name}; that is not supported")
         raise InputError(f"PTX: unknown symbol {name} in {function.name}")
 
     def _instruction(self, function, text, register, line) -> Instruction:
@@ -547,15 +546,21 @@ def _declaration(text: str) -> tuple[str, int, int, str, bytes, bool]:
 # --- inlining ---------------------------------------------------------------------------------------------------------
 
 
-def _inline(kernel: _Function, functions: dict[str, _Function]) -> Kernel:
-    return _Inliner(kernel, functions).kernel()
+# Spaces of shared variables until they have a place: those of the module, and dynamic shared memory.
+MODULE_SHARED, DYNAMIC_SHARED = "module-shared", "dynamic-shared"
+
+
+def _inline(kernel: _Function, parser: _Parser) -> Kernel:
+    return _Inliner(kernel, parser.functions, parser.module_shared).kernel()
 
 
 class _Inliner:
     """Flattens a call tree. Each call gets a number; names of the callee carry it, so nothing is shared by accident."""
 
-    def __init__(self, root: _Function, functions: dict[str, _Function]) -> None:
-        self.root, self.functions = root, functions
+    def __init__(
+        self, root: _Function, functions: dict[str, _Function], module_shared: dict[str, tuple[int, int]]
+    ) -> None:
+        self.root, self.functions, self.module_shared = root, functions, module_shared
         self.out: list[Instruction] = []
         self.labels: dict[str, int] = {}
         self.calls = 0
@@ -568,8 +573,7 @@ class _Inliner:
         self._emit(self.root, "", {}, None, (self.root.name,))
         self._check_arguments()
         root = self.root
-        dynamic = _align(self.shared_bytes, 16)
-        instructions = [_resolve_dynamic(i, dynamic) for i in self.out]
+        instructions, dynamic = self._place_shared()
         return Kernel(
             root.name,
             tuple(root.params),
@@ -579,6 +583,33 @@ class _Inliner:
             instructions,
             self.labels,
         )
+
+    def _place_shared(self) -> tuple[list[Instruction], int]:
+        """Give module variables in shared memory one place each, whoever uses them, and dynamic memory the rest.
+
+        -> the instructions and where dynamic shared memory starts.
+        """
+        places: dict[str, int] = {}
+        for item in self.out:
+            for operand in item.srcs:
+                symbol = operand.base if isinstance(operand, Address) else operand
+                if isinstance(symbol, Symbol) and symbol.space == MODULE_SHARED and symbol.name not in places:
+                    align, size = self.module_shared[symbol.name]
+                    places[symbol.name] = _align(self.shared_bytes, align)
+                    self.shared_bytes = places[symbol.name] + size
+        dynamic = _align(self.shared_bytes, 16)
+
+        def place(operand: Operand) -> Operand:
+            match operand:
+                case Symbol(name, space, offset) if space in (MODULE_SHARED, DYNAMIC_SHARED):
+                    return Symbol(name, "shared", offset + (places[name] if space == MODULE_SHARED else dynamic))
+                case Address(Symbol() as base, offset):
+                    placed = place(base)
+                    assert isinstance(placed, Symbol)
+                    return Address(placed, offset)
+            return operand
+
+        return [replace(item, srcs=tuple(map(place, item.srcs))) for item in self.out], dynamic
 
     def _check_arguments(self) -> None:
         """An argument must be read with the width it was written with: the pseudo-registers are not memory."""
@@ -609,7 +640,7 @@ class _Inliner:
                     return Reg(name + tag, kind) if tag else operand
                 case NotReg(reg):
                     return NotReg(rename(reg))
-                case Symbol(name, space, offset) if space in bases and offset >= 0:
+                case Symbol(name, space, offset) if space in bases:
                     return Symbol(name, space, offset + bases[space])
                 case Address(base, offset):
                     return Address(rename(base), offset)
@@ -700,17 +731,3 @@ class _Inliner:
         self.call_line = line
         self._emit(callee, inner, bound, after, (*chain, name))
         self.labels[after] = len(self.out)
-
-
-def _resolve_dynamic(item: Instruction, dynamic: int) -> Instruction:
-    """Dynamic shared memory starts after all static shared memory of the kernel and what it calls."""
-
-    def resolve(operand):
-        match operand:
-            case Symbol(name, "shared", offset) if offset < 0:
-                return Symbol(name, "shared", dynamic)
-            case Address(Symbol() as base, offset):
-                return Address(resolve(base), offset)
-        return operand
-
-    return replace(item, srcs=tuple(map(resolve, item.srcs)))
