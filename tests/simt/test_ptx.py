@@ -168,7 +168,7 @@ def test_a_function_called_twice_keeps_its_registers_and_arrays_apart():
     run("""__noinline__ __device__ int pick(int seed, int at) {
                int kept[4]; for (int k = 0; k < 4; ++k) kept[k] = seed * (k + 1); return kept[at & 3]; }
            __noinline__ __device__ int both(int a, int b) { return pick(a, b) * 1000 + pick(b, a); }
-           extern "C" __global__ void kernel(int* out) { 
+           extern "C" __global__ void kernel(int* out) {
                int t = threadIdx.x; out[t] = both(t, t + 1) + pick(t, 2); }""",
         out)  # fmt: skip
     t = np.arange(32)
@@ -208,10 +208,10 @@ def test_structures_pass_through_functions():
 
 def test_functions_return_from_the_middle_for_some_lanes_only():
     out = np.zeros(32, "i4")
-    run("""__noinline__ __device__ int f(int x) { 
+    run("""__noinline__ __device__ int f(int x) {
                if (x < 4) return 1; for (int k = 0; k < x; ++k) if (k * k > x) return k;
                return -1; }
-           extern "C" __global__ void kernel(int* out) { 
+           extern "C" __global__ void kernel(int* out) {
                int t = threadIdx.x; if (t != 9) out[t] = f(t); }""", out)  # fmt: skip
 
     def f(x):
