@@ -17,7 +17,7 @@ The checker is compiled by numba and kept in numba's own cache.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numba
@@ -59,7 +59,22 @@ _SIGNATURE = types.int32(_WORD, _WORD, _WORD, types.int64, types.int64, types.in
 _UNBOUNDED = 1 << 40
 
 
-@numba.njit(cache=True)
+def _compiled(function: Callable[..., Any]) -> Any:
+    """Compile, and keep the result where numba finds a folder for it."""
+    try:
+        return numba.njit(cache=True)(function)
+    except RuntimeError:  # neither the package's folder nor the user's cache can be written
+        return numba.njit(function)
+
+
+def _callback(function: Callable[..., Any]) -> Any:
+    try:
+        return numba.cfunc(_SIGNATURE, cache=True)(function)
+    except RuntimeError:
+        return numba.cfunc(_SIGNATURE)(function)
+
+
+@_compiled
 def _report(data, kind, site, other, block, address):
     start = data[_FINDINGS_AT]
     count = data[_FINDING_COUNT]
@@ -79,7 +94,7 @@ def _report(data, kind, site, other, block, address):
         data[_FINDING_COUNT] = count + 1
 
 
-@numba.njit(cache=True)
+@_compiled
 def _inside(data, address, width):
     """Whether the bytes lie in one allocation. The one that held the last access is tried first."""
     ranges, count = data[_RANGES_AT], data[_RANGE_COUNT]
@@ -94,7 +109,7 @@ def _inside(data, address, width):
     return False
 
 
-@numba.njit(cache=True)
+@_compiled
 def _conflict(data, slots, epoch, warp, lane, warp_epoch):
     """-> (kind of conflict or 0, site) of an access with the earlier ones in a granule's two slots."""
     for number in range(2):
@@ -108,7 +123,7 @@ def _conflict(data, slots, epoch, warp, lane, warp_epoch):
     return 0, np.int64(-1)
 
 
-@numba.njit(cache=True)
+@_compiled
 def _remember(data, slots, epoch, warp, lane, warp_epoch, site):
     """Two different warps are enough to find every race with a third; of one warp, the lanes since its last barrier."""
     chosen = slots
@@ -127,7 +142,7 @@ def _remember(data, slots, epoch, warp, lane, warp_epoch, site):
     data[chosen + 4] = site
 
 
-@numba.njit(cache=True)
+@_compiled
 def _look_at_shared(data, job, offset, width, kind, site, warp, lane, warp_epoch):
     block = job[_BLOCK]
     epoch = job[_EPOCH]
@@ -151,7 +166,7 @@ def _look_at_shared(data, job, offset, width, kind, site, warp, lane, warp_epoch
             data[shadow] = block + 1
 
 
-@numba.cfunc(_SIGNATURE, cache=True)
+@_callback
 def _check(data_at, job_at, context_at, site, first_lane, bits, addresses_at, displacement):
     """-> the lanes that may go on. addresses: of the chunk's lanes, the first of which is ``first_lane``."""
     data = carray(data_at, _UNBOUNDED)
@@ -210,7 +225,7 @@ class Checker:
             shared = {"shared": 1, "generic": 2}.get(site.space, 0)
             data[sites_at + _SITE_WORDS * number :][:_SITE_WORDS] = _KINDS.index(site.kind), site.width, shared
         data[shadow_at:findings_at].reshape(granules, _SHADOW_WORDS)[:, 1::_SLOT_WORDS] = -1
-        job.set("check", int(_check.address or 0))
+        job.set("check", _check.address)
         job.set("check_data", data.ctypes.data)
         # The generator must not start at zero; neighbouring seeds should start far apart.
         job.set("random", int(np.random.default_rng(seed).integers(1, 2**63)))

@@ -114,6 +114,9 @@ def _directed_conversion(ctx: Lanes, item: Instruction) -> None:
     if is_float(source):
         _write_float(ctx, item, target, result)
     else:
+        if operation == "uitofp":
+            # Where the processor has no such conversion, LLVM subtracts, and zero rounded downwards becomes -0.
+            result = ctx.w.intrinsic("llvm.fabs", ELEMENT[target], result)
         ctx.write(item, 0, result, ELEMENT[target])
 
 
