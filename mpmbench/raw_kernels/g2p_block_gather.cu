@@ -23,7 +23,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) g2p_block_gather(
         const int y = block.first.y - LEFT + place.y;
         const int z = block.first.z - LEFT + place.z;
         real4 node = {0, 0, 0, 0};
-        if (in_grid(domain, x, y, z)) node = velocities[node_index(domain, x, y, z)];
+        if (in_grid(domain, x, y, z)) node = load(velocities + node_index(domain, x, y, z));
         arena[index] = node;
     }
     __syncthreads();

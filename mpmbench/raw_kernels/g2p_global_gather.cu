@@ -34,7 +34,7 @@ extern "C" __global__ void g2p_global_gather(
         const Offset o = support_offset(n);
 #pragma unroll
         for (int j = 0; j < BATCH; ++j) {
-            gather(sum[j], weights[j], f[j], o, *node_at(domain, lowest[j], o));
+            gather(sum[j], weights[j], f[j], o, load(node_at(domain, lowest[j], o)));
         }
     }
 

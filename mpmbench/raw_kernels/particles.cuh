@@ -17,7 +17,7 @@ __device__ inline int attribute_index(int particle_count, int p, int a) {
 }
 
 __device__ inline real4 load_attribute(const real4* particles, int particle_count, int p, int a) {
-    return particles[attribute_index<ATTRIBUTE_COUNT>(particle_count, p, a)];
+    return load(particles + attribute_index<ATTRIBUTE_COUNT>(particle_count, p, a));
 }
 
 __device__ inline void store_result(real4* results, int particle_count, int p, int a, const real4& value) {

@@ -18,6 +18,18 @@ struct real3 {
     real x, y, z;
 };
 
+// Reads memory that nothing writes during the kernel. Always whole 16-byte requests: left to itself the compiler splits a
+// vector of which one component is not used.
+__device__ inline real4 load(const real4* place) {
+#if REAL_IS_DOUBLE
+    const double2* halves = reinterpret_cast<const double2*>(place);
+    const double2 low = __ldg(halves), high = __ldg(halves + 1);
+    return {low.x, low.y, high.x, high.y};
+#else
+    return __ldg(place);
+#endif
+}
+
 constexpr int WARP = 32;
 
 // Rounded product that is never fused with an addition, so that all kernels compute the same cell.
