@@ -84,6 +84,24 @@ def test_a_gpu_that_adds_wrongly_is_found_out_and_not_timed(gpu: FakeGpu) -> Non
     assert all(row.passed for row in rows.values())
 
 
+def test_a_gpu_that_goes_wrong_in_the_long_run_is_found_out(gpu: FakeGpu) -> None:
+    """Such as a strategy that does not reset something of its own between repeats."""
+    launches = []
+
+    def lose_some_later(name: str, arguments: tuple[Any, ...]) -> None:
+        if name == "p2g_global_atomic":
+            launches.append(name)
+            if len(launches) > 2:
+                arguments[-1][...] *= 0.999
+
+    gpu.execute = on_the_engine(lose_some_later)
+    rows = {row.variant: row for row in run_selftest("cuda", quick=True)}
+    wrong = rows.pop("p2g_global_atomic")
+    assert "wrong once it has run many times" in wrong.problem
+    assert wrong.seconds is None
+    assert all(row.passed for row in rows.values()), "every strategy can be repeated"
+
+
 def test_a_failing_launch_fails_its_rows_only(gpu: FakeGpu) -> None:
     run = on_the_engine()
 
