@@ -54,6 +54,8 @@ extern "C" __global__ void kernel(const unsigned* in, const float* fin, unsigned
 {body}
     unsigned* o = out + i * {SLOTS};
     float* p = fout + i * {SLOTS};
+    o[5] = a;
+    if {self.condition(0)} return;
     o[0] = a; o[1] = b; o[2] = c; o[3] = d; o[4] = local[a % 6]; p[0] = f; p[1] = g; p[2] = h; p[3] = (float)wide;
 }}
 """
@@ -86,6 +88,10 @@ extern "C" __global__ void kernel(const unsigned* in, const float* fin, unsigned
                 f"(unsigned)(int)(fminf(fmaxf({self.real(1)}, -1e6f), 1e6f))",
                 f"__funnelshift_l({x}, {y}, {self.rng.randint(0, 31)})",
                 f"mix({x}, {self.real(1)}, {self.rng.randint(0, 5)})",
+                f"(unsigned)(((unsigned long long){x} * {y}) >> {self.rng.randint(0, 40)})",
+                f"(unsigned)((long long)(int){x} % (long long)({y} | 1u))",
+                f"(unsigned)((signed char){x} + (short){y})",
+                f"__byte_perm({x}, {y}, {self.rng.randint(0, 0x7777)})",
             )
         )
 
@@ -202,8 +208,14 @@ extern "C" __global__ void kernel(const unsigned* in, const float* fin, unsigned
             self.line("__syncthreads();")
             self.line(f"{self.rng.choice(INTS)} += totals[{self.integer(1)} & 3u];")
             self.line("__syncthreads();")
+        elif pick < 0.85:
+            self.scope(f"if (blockIdx.x {self.rng.choice(('== 1', '!= 1', '< 2'))})", 1)
+            self.depth += 1
+            self.exchange()
+            self.depth -= 1
+            self.line("}")
         elif self.block % 32 == 0:
-            self.warp_operation()
+            self.rng.choice((self.warp_operation, self.warp_operation, self.half_warps, self.warp_exchange))()
         else:
             self.assignment()
 
@@ -213,6 +225,30 @@ extern "C" __global__ void kernel(const unsigned* in, const float* fin, unsigned
         self.line(f"{array}[t] = {value};")
         self.line("__syncthreads();")
         self.line(f"{self.rng.choice(kind)} = {array}[(t * {step} + {shift}) % {self.block}];")
+        self.line("__syncthreads();")
+
+    def half_warps(self) -> None:
+        """The halves of each warp run other code, then work among themselves."""
+        name = self.rng.choice(INTS)
+        for head, mask in (("if ((t & 31) < 16)", "0x0000ffffu"), ("} else", "0xffff0000u")):
+            self.scope(head, 1)
+            operation = self.rng.choice(
+                (
+                    f"__shfl_xor_sync({mask}, {self.integer(1)}, {self.rng.randint(1, 15)})",
+                    f"__ballot_sync({mask}, {self.condition()})",
+                    f"__shfl_sync({mask}, {self.integer(1)}, {self.rng.randint(0, 15)}, 16)",
+                )
+            )
+            self.line(f"    {name} += {operation};")
+        self.line("}")
+        self.line("__syncwarp();")
+
+    def warp_exchange(self) -> None:
+        """Through shared memory, among the lanes of one warp only."""
+        self.line("__syncthreads();")
+        self.line(f"words[t] = {self.integer(1)};")
+        self.line("__syncwarp();")
+        self.line(f"{self.rng.choice(INTS)} += words[(t & ~31) + ((t * 3 + {self.rng.randint(0, 31)}) & 31)];")
         self.line("__syncthreads();")
 
     def warp_operation(self) -> None:
