@@ -320,7 +320,7 @@ def test_other_modes(device, kernel: str) -> None:
 
 @pytest.mark.parametrize("kernel", OUTPUTS)
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_primitives_move_each_number_once(kernel: str, dtype: str) -> None:
+def test_primitives_move_each_number_once_and_lanes_stay_together(kernel: str, dtype: str) -> None:
     counting = devices.open_device("simulated", arch="sm_52", mode="count")
     primitive = get(kernel)
     environment = Environment.capture()
@@ -330,4 +330,5 @@ def test_primitives_move_each_number_once(kernel: str, dtype: str) -> None:
         assert not record.findings
     total = record.transfer_counters.total
     reals = 9 + sum(OUTPUTS[kernel])
+    assert total.div_branch == 0
     assert 32 * total.sectors == record.floor_bytes == 4096 * reals * np.dtype(dtype).itemsize
