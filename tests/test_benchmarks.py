@@ -138,10 +138,10 @@ def test_rounds_end_on_a_machine_that_is_never_calm(clock):
         clock.work(1)
         clock.wall += 1
 
-    sampled = run_rounds([Arm("a", shared, lambda: None)], rounds=2, seed=0)
-    assert (sampled.disturbed, sampled.kept_disturbed) == (2, 2)
-    assert sampled.seconds["a"].tolist() == [2, 2]
-    assert sampled.processor_seconds["a"].tolist() == [1, 1]
+    sampled = run_rounds([Arm("a", shared, lambda: None)], rounds=6, seed=0)
+    assert (sampled.disturbed, sampled.kept_disturbed) == (2, 6)
+    assert sampled.seconds["a"].tolist() == [2] * 6
+    assert sampled.processor_seconds["a"].tolist() == [1] * 6
 
 
 # --- peers ----------------------------------------------------------------------------------------------------------
