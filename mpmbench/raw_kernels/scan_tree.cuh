@@ -38,8 +38,9 @@ __device__ inline int tree_scan(int* tile) {
             const int low = padded(apart * (2 * t + 1) - 1);
             const int high = padded(apart * (2 * t + 2) - 1);
             const int left = tile[low];
-            tile[low] = tile[high];
-            tile[high] += left;
+            const int before = tile[high];
+            tile[low] = before;
+            tile[high] = before + left;
         }
     }
     __syncthreads();
