@@ -60,8 +60,8 @@ def pin_to_one_core() -> int:
 def run_rounds(arms: Sequence[Arm], rounds: int, seed: int) -> Rounds:
     """Time every arm ``rounds`` times after one untimed run of each.
 
-    A round in which some arm lost the core for more than 3 % of its sample is run again, as long as such rounds stay the
-    exception: at most a third of ``rounds``. The choice looks at processor time only, never at which arm was faster.
+    A round in which some arm lost the core for more than 3 % of its sample is run again, as long as such rounds stay
+    the exception: at most a third of ``rounds``. The choice looks at processor time, never at which arm was faster.
     """
     allowed = max(1, rounds // 3)
     random = np.random.default_rng(seed)
