@@ -11,7 +11,7 @@ import numpy as np
 
 from mpmbench.device import CompiledKernel, Device, Launch
 from mpmbench.errors import InputError, MpmbenchError
-from mpmbench.grid import Grid
+from mpmbench.grid import Grid, Triple
 from mpmbench.launcher import INT32_LIMIT, THREADS, Launcher
 from mpmbench.primitives.scan_lookback import state_length
 from mpmbench.variants import ATTRIBUTES, AXES, RESULTS, Variant
@@ -59,6 +59,14 @@ def domain_type(dtype: Any) -> np.dtype:
     return np.dtype(
         [("shape", "i4", 3), ("blocks", "i4", 3), ("origin", real, 3), ("dx", real), ("inv_dx", real)], align=True
     )
+
+
+def domain_value(grid: Grid, dtype: Any, block_shape: Triple = (1, 1, 1)) -> Any:
+    """The grid as kernels take it, by value."""
+    domain = np.zeros((), domain_type(dtype))
+    domain["shape"], domain["blocks"], domain["origin"] = grid.shape, grid.blocks(block_shape), grid.origin
+    domain["dx"], domain["inv_dx"] = grid.dx, 1 / grid.dx
+    return domain[()]
 
 
 def bin_count(grid: Grid, axes: Mapping[str, Any]) -> int:
@@ -133,11 +141,7 @@ class Workspace(Launcher):
         for name, (shape, dtype) in table.items():
             if name not in self.buffers:
                 self.buffers[name] = self.device.empty(shape, dtype)
-        domain = np.zeros((), domain_type(self.axes["dtype"]))
-        domain["shape"], domain["origin"] = self.grid.shape, self.grid.origin
-        domain["blocks"] = self.grid.blocks(self.axes.get("block_shape", (1, 1, 1)))
-        domain["dx"], domain["inv_dx"] = self.grid.dx, 1 / self.grid.dx
-        self.domain = domain[()]
+        self.domain = domain_value(self.grid, self.axes["dtype"], self.axes.get("block_shape", (1, 1, 1)))
 
     # What kernels take as arguments, under the names that they give them.
 

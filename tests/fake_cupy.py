@@ -327,6 +327,18 @@ def fake_cupy(gpu: FakeGpu) -> SimpleNamespace:
             raise gpu.fail_synchronize
         return a.host.copy()
 
+    @follows("argsort")
+    def argsort(a: Array) -> Array:
+        assert gpu.streams, "sorted on the default stream"
+        gpu.now += gpu.seconds.get("argsort", 1e-5)
+        gpu.log("argsort", len(a.host))
+        return Array(np.argsort(a.host, kind="stable"))
+
+    @follows("copyto")
+    def copyto(dst: Array, src: Array) -> None:
+        assert gpu.streams, "copied on the default stream"
+        np.copyto(dst.host, src.host, casting="same_kind")
+
     @follows("cuda.runtime.getDeviceCount")
     def get_device_count() -> int:
         if gpu.fail_count is not None:
@@ -355,7 +367,9 @@ def fake_cupy(gpu: FakeGpu) -> SimpleNamespace:
         __version__=cupy.__version__,
         RawModule=RawModule,
         asarray=asarray,
+        argsort=argsort,
         asnumpy=asnumpy,
+        copyto=copyto,
         empty=empty,
         get_default_memory_pool=get_default_memory_pool,
         cuda=SimpleNamespace(

@@ -9,6 +9,7 @@ between two events.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import ModuleType
@@ -151,9 +152,25 @@ class CudaDevice:
             raise InputError(f"{source.name} does not compile for {self.arch}: {_first_error(str(error))}") from error
         return CompiledKernel(source, entry, kernel)
 
+    def library_sort(self) -> CompiledKernel:
+        """CuPy's own stable sort (CUB's radix sort for integers) to be launched like a kernel of ours.
+
+        Its arguments are keys (n,) and order (n,) int64, which becomes the places of the keys from small to large; a
+        launch's geometry means nothing to it. It allocates on every call, as CuPy does.
+        """
+        source = f"cupy.argsort of CuPy {self._cupy.__version__}"
+        digest = hashlib.sha256(source.encode()).hexdigest()
+        return CompiledKernel(KernelSource("cupy.argsort", source, (), digest), "argsort", self._argsort)
+
+    def _argsort(self, grid: object, block: object, args: tuple[Any, Any], shared_mem: int = 0) -> None:
+        keys, order = args
+        self._cupy.copyto(order, self._cupy.argsort(keys))
+
     def info(self, kernel: CompiledKernel) -> KernelInfo:
         """What the driver says of the loaded kernel. It counts spills as local memory: how many they are says
         ``ptxas``, where it is installed and knows this GPU; else ``spill_bytes`` is None."""
+        if kernel.handle == self._argsort:
+            return KernelInfo(arch=self.arch)
         with self._errors(f"cannot ask for the attributes of {kernel.entry}"), self._current():
             attributes = kernel.handle.attributes
         try:

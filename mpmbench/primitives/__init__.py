@@ -93,7 +93,7 @@ class Primitive:
     """One strategy for one operation.
 
     name: also the stem of its module and its kernel; it begins with the operation's.  summary: one line.
-    kernel: stem of the ``.cu`` file and name of its function.
+    kernel: stem of the ``.cu`` file and name of its function; empty for a library's.
     axes: axis -> values it has, the default first.
     build: Bench -> uploaded inputs, outputs and the launches that are the strategy.
     reference: citation.
@@ -151,7 +151,7 @@ def get(name: str, extra_dirs: Sequence[str | Path] = ()) -> Primitive:
 def _problem(primitive: Primitive) -> str | None:
     if not primitive.name.startswith(f"{primitive.operation.name}_"):
         return f"name {primitive.name!r} must begin with its operation, {primitive.operation.name}_"
-    if not primitive.kernel_path.is_file():
+    if primitive.kernel and not primitive.kernel_path.is_file():
         return f"kernel {primitive.kernel_path} does not exist"
     return None
 

@@ -4,11 +4,15 @@
 // particle p sits at a * n + p (SOA) or p * ATTRIBUTE_COUNT + a. G2P writes a buffer of its own with velocity and, for
 // APIC, the rows of C, laid out the same way.
 //
-// Constants: SOA, APIC, INDEXED (read through the sorted index).
+// Constants: SOA, APIC, INDEXED (read through the sorted index), and ATTRIBUTES for particles with another number of them.
 #pragma once
 #include "real.cuh"
 
+#ifdef ATTRIBUTES
+constexpr int ATTRIBUTE_COUNT = ATTRIBUTES;
+#else
 constexpr int ATTRIBUTE_COUNT = APIC ? 5 : 2;
+#endif
 constexpr int RESULT_COUNT = APIC ? 4 : 1;
 
 template <int COUNT>
