@@ -1,9 +1,13 @@
-// Associative operators with their neutral elements, for numbers and four-component values, and what a warp does with
-// them by shuffles alone.
+// Operators on numbers and four-component values: lengths, associative operators with their neutral elements, and what a
+// warp does with them by shuffles alone.
 #pragma once
 #include "real.cuh"
 
 constexpr unsigned ALL_LANES = 0xffffffffu;
+
+__device__ inline int length(int a) { return abs(a); }
+__device__ inline real length(real a) { return fabs(a); }
+__device__ inline real length(const real4& a) { return sqrt(a.x * a.x + a.y * a.y + a.z * a.z + a.w * a.w); }
 
 __device__ inline int lowest(int) { return -2147483647 - 1; }
 __device__ inline float lowest(float) { return __int_as_float(0xff800000); }

@@ -8,10 +8,6 @@
 
 using element = ELEMENT;
 
-__device__ inline int length(int a) { return abs(a); }
-__device__ inline real length(real a) { return fabs(a); }
-__device__ inline real length(const real4& a) { return sqrt(a.x * a.x + a.y * a.y + a.z * a.z + a.w * a.w); }
-
 // --- unary operators --------------------------------------------------------------------------------------------------
 
 struct Identity {
