@@ -482,13 +482,11 @@ class SegmentBody:
 
     def observe(self, site: Site, buffer: str, displacement: int, base: str) -> None:
         if self.counts:
-            self.observe_run([site], buffer, displacement, base)
+            self.observe_run([site], buffer, displacement)
             return
         self._check(site, buffer, displacement, base)
 
-    def observe_run(
-        self, sites: list[Site], buffer: str, displacement: int, base: str, bits: str | None = None
-    ) -> None:
+    def observe_run(self, sites: list[Site], buffer: str, displacement: int, bits: str | None = None) -> None:
         """Count neighbouring accesses once all lanes have stored their addresses.
 
         bits: the chunk's active lanes, for accesses that were put off; else those of the instruction at hand.
@@ -504,7 +502,7 @@ class SegmentBody:
             mask = warp_mask
             if mask_at is not None:
                 mask = self.w.value(f"and i32 {self.w.load('i32', mask_at, 4)}, {warp_mask}")
-            codegen_count.count_sites(self.g, sites, first, buffer, displacement, base, mask)
+            codegen_count.count_sites(self.g, sites, first, buffer, displacement, mask)
 
         self.after_chunks.append(after)
 
@@ -854,7 +852,7 @@ class _Segment:
         if g.mode == "count":
             stay = [w.value(f"xor i32 {taken}, {mask}")] if self.last.guard is not None else []
             codegen_count.count_table_branch(g, n, [*ways.values(), *stay], mask)
-        lowest = min((*targets, n + 1) if self.last.guard is not None else targets)
+        lowest = min(*targets, n + 1)  # other lanes may be waiting between here and the lowest target
         if lowest <= n:
             self._spend(lowest)
         w.emit(f"br label %{g.chain(lowest)}")

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from mpmbench.simt.codegen_ir import Writer, bits_of, integer_of
-from mpmbench.simt.ptx import Imm, Instruction, Operand, Reg, Symbol, Vector
+from mpmbench.simt.ptx import Imm, Instruction, Operand, Vector
 
 ELEMENT = {"pred": "i1", "f32": "float", "f64": "double"}
 ELEMENT |= {f"{kind}{bits}": f"i{bits}" for kind in "sub" for bits in (8, 16, 32, 64)}
@@ -161,13 +161,13 @@ def _write_wide(ctx: Lanes, item: Instruction, kind: str, product: str) -> None:
             product = w.binary("add", wide, product, addend)
         ctx.write(item, 0, product, wide)
         return
-    upper = w.cast("trunc", w.binary("lshr", wide, product, _wide_shift(w, wide)), wide, narrow)
+    upper = w.cast("trunc", w.binary("lshr", wide, product, _wide_shift(wide)), wide, narrow)
     if item.root == "mad":
         upper = w.binary("add", narrow, upper, ctx.read(item.srcs[2], kind))
     ctx.write(item, 0, upper, narrow)
 
 
-def _wide_shift(w: Writer, wide: str) -> str:
+def _wide_shift(wide: str) -> str:
     return f"splat ({wide} {int(wide[1:]) // 2})"
 
 
@@ -866,16 +866,3 @@ _FPU_ROOTS = frozenset(
     {"add", "sub", "mul", "mad", "fma", "div", "rcp", "sqrt", "rsqrt", "ex2", "lg2", "sin", "cos", "tanh"}
     | {"setp", "set", "slct", "cvt", "min", "max"}
 )
-
-__all__ = [
-    "ELEMENT",
-    "EMITTERS",
-    "Lanes",
-    "Refused",
-    "Reg",
-    "Symbol",
-    "flush",
-    "is_float",
-    "is_float_arithmetic",
-    "is_signed",
-]

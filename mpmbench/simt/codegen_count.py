@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from mpmbench.simt.codegen_ir import WARP, Writer
-from mpmbench.simt.scheduler import JOB
 
 if TYPE_CHECKING:
     from mpmbench.simt.codegen import _Generator
@@ -73,73 +72,61 @@ def count_table_branch(g: _Generator, number: int, ways: Sequence[str], mask: st
     _add(g, SEGMENT_WORDS * number + 2, w.value(f"zext i1 {w.value(f'xor i1 {together}, true')} to i64"))
 
 
-def count_sites(
-    g: _Generator, sites: Sequence[Site], first: int, buffer: str, displacement: int, base: str, mask: str
-) -> None:
-    """One request of each of ``sites``, which access consecutive words; first: number of the first of them."""
+def count_sites(g: _Generator, sites: Sequence[Site], first: int, buffer: str, displacement: int, mask: str) -> None:
+    """One request of each of ``sites``, which access consecutive words; first: number of the first of them.
+
+    buffer: addresses of the 32 lanes; in shared memory they may count from its start, which is aligned.
+    """
     w, site = g.w, sites[0]
-    start = displacement
-    at: str | int = start
-    if site.space == "shared":
-        function = {"atomic": "count_shared_atomics"}.get(
-            site.kind, f"count_shared_{_group(site.element * _vector(site))}"
-        )
-    elif site.space == "local":
-        function = "count_local"
-    else:
-        function = "count_atomics" if site.kind == "atomic" else "count_global"
     counters = w.at(_counters(g), 8 * (SEGMENT_WORDS * len(g.segments) + SITE_WORDS * first))
     if site.space == "generic":
-        _count_generic(g, sites, counters, buffer, at, mask, site)
-        return
-    _call(w, function, buffer, at, mask, _part(w, counters, site.space), len(sites), site.element)
+        _count_generic(g, sites, counters, buffer, displacement, mask)
+    else:
+        _count_part(w, sites, site.space, counters, buffer, displacement, mask)
 
 
-def _vector(site: Site) -> int:
-    return site.width // site.element
+def _count_part(
+    w: Writer, sites: Sequence[Site], space: str, counters: str, buffer: str, displacement: int, mask: str
+) -> None:
+    """Call the function that counts a request in one space."""
+    site = sites[0]
+    if space == "local":
+        function = "count_local"
+    elif space == "shared":
+        function = "count_shared_atomics" if site.kind == "atomic" else f"count_shared_{_group(site.width)}"
+    else:
+        function = "count_atomics" if site.kind == "atomic" else "count_global"
+    part = w.at(counters, 8 * PART_WORDS * PARTS.index(space))
+    w.declare(f"declare void @{function}(ptr, i64, i32, ptr, i64, i64)")
+    w.emit(
+        f"call void @{function}(ptr {buffer}, i64 {displacement}, i32 {mask}, ptr {part}, i64 {len(sites)}, "
+        f"i64 {site.element})"
+    )
 
 
 def _group(width: int) -> int:
     return 16 if width > 8 else 8 if width > 4 else 4
 
 
-def _part(w: Writer, counters: str, space: str) -> str:
-    return w.at(counters, 8 * PART_WORDS * PARTS.index(space))
-
-
-def _call(
-    w: Writer, function: str, buffer: str, at: str | int, mask: str, counters: str, count: int, element: int
-) -> None:
-    w.declare(f"declare void @{function}(ptr, i64, i32, ptr, i64, i64)")
-    w.emit(f"call void @{function}(ptr {buffer}, i64 {at}, i32 {mask}, ptr {counters}, i64 {count}, i64 {element})")
-
-
 def _count_generic(
-    g: _Generator, sites: Sequence[Site], counters: str, buffer: str, at: str | int, mask: str, site: Site
+    g: _Generator, sites: Sequence[Site], counters: str, buffer: str, displacement: int, mask: str
 ) -> None:
     """Sort the lanes by the window their addresses fall into; each part is a request of its own."""
     w = g.w
     lanes, w.lanes = w.lanes, WARP
     addresses = w.load("<32 x i64>", buffer, 64)
-    if at:
-        addresses = w.binary("add", "i64", addresses, w.splat("i64", str(at)))
+    if displacement:
+        addresses = w.binary("add", "i64", addresses, w.splat_int("i64", displacement))
+    shared, local = g.job_field("shared"), g.job_field("local")
+    sizes = g.job_field("shared_bytes"), w.value(f"sub i64 {g.job_field('local_end')}, {local}")
     rest = mask
-    for space, start, end in (("shared", "shared", None), ("local", "local", "local_end")):
-        first = g.job_field(start)
-        if end is None:
-            size = g.job_field("shared_bytes")
-        else:
-            size = w.value(f"sub i64 {g.job_field(end)}, {first}")
+    for space, first, size in (("shared", shared, sizes[0]), ("local", local, sizes[1])):
         distance = w.binary("sub", "i64", addresses, w.splat("i64", first))
         inside = w.compare("icmp ult", "i64", distance, w.splat("i64", size))
         bits = w.value(f"and i32 {w.value(f'bitcast <32 x i1> {inside} to i32')}, {mask}")
-        function = "count_local"
-        if space == "shared":
-            function = "count_shared_atomics" if site.kind == "atomic" else f"count_shared_{_group(site.width)}"
-        _call(w, function, buffer, at, bits, _part(w, counters, space), len(sites), site.element)
+        _count_part(w, sites, space, counters, buffer, displacement, bits)
         rest = w.value(f"and i32 {rest}, {w.value(f'xor i32 {bits}, -1')}")
-    function = "count_atomics" if site.kind == "atomic" else "count_global"
-    _call(w, function, buffer, at, rest, _part(w, counters, "global"), len(sites), site.element)
+    _count_part(w, sites, "global", counters, buffer, displacement, rest)
     w.lanes = lanes
 
 
@@ -404,17 +391,3 @@ def _local_function() -> _Function:
     f.add(0, "1")
     f.add(1, f.count_bits("%mask"))
     return f
-
-
-__all__ = [
-    "JOB",
-    "PARTS",
-    "PART_WORDS",
-    "SEGMENT_WORDS",
-    "SITE_WORDS",
-    "count_branch",
-    "count_segment",
-    "count_sites",
-    "counter_words",
-    "support_text",
-]

@@ -131,7 +131,7 @@ def emit_access(ctx: SegmentBody, index: int, item: Instruction) -> None:
 # --- addresses ----------------------------------------------------------------------------------------------------
 
 
-def _place(ctx: SegmentBody, index: int, space: str, address: Address) -> Place:
+def _place(ctx: SegmentBody, space: str, address: Address) -> Place:
     w = ctx.w
     base = ctx.shared_pointer() if space == "shared" else "null"
     match address.base:
@@ -163,7 +163,7 @@ def _address_buffer(ctx: SegmentBody, index: int, space: str, address: Address) 
         buffer, anchored, base = known
         return buffer, form.constant - anchored, base, key, form.constant
     w = ctx.w
-    place = _place(ctx, index, space, address)
+    place = _place(ctx, space, address)
     vector = place.vector
     if place.displacement and abs(place.displacement) >= SINK_REACH - 64:
         vector = w.binary("add", "i64", vector, w.splat_int("i64", place.displacement))
@@ -223,10 +223,10 @@ def _load(ctx: SegmentBody, index: int, item: Instruction, access: Access, addre
         whole = _load_small(ctx, index, access, address, f"i{8 * access.width}")
         values = _split(ctx, whole, 8 * access.width, access.count, element)
     elif access.width in (4, 8):
-        whole = _gather(ctx, _place(ctx, index, access.space, address), f"i{8 * access.width}", access.width)
+        whole = _gather(ctx, _place(ctx, access.space, address), f"i{8 * access.width}", access.width)
         values = _split(ctx, whole, 8 * access.width, access.count, element)
     elif access.count == 2 and access.width == 16:
-        place = _place(ctx, index, access.space, address)
+        place = _place(ctx, access.space, address)
         values = [_gather(ctx, place, element, 8, 8 * part) for part in range(2)]
     else:
         raise Refused
@@ -357,9 +357,9 @@ def _store(ctx: SegmentBody, index: int, item: Instruction, access: Access, addr
         _store_small(ctx, index, access, address, f"i{8 * access.width}", whole)
     elif access.width in (4, 8):
         whole = _join(ctx, values, 8 * access.width, element)
-        _scatter(ctx, _place(ctx, index, access.space, address), f"i{8 * access.width}", access.width, whole)
+        _scatter(ctx, _place(ctx, access.space, address), f"i{8 * access.width}", access.width, whole)
     elif access.count == 2 and access.width == 16:
-        place = _place(ctx, index, access.space, address)
+        place = _place(ctx, access.space, address)
         for part, value in enumerate(values):
             _scatter(ctx, place, element, 8, value, 8 * part)
     else:
@@ -627,7 +627,7 @@ def _count_run(ctx: SegmentBody, run: list[Deferred]) -> None:
         return
     first = run[0]
     sites = [Site(entry.index, "atomic", entry.access.space, entry.access.width, entry.access.width) for entry in run]
-    ctx.observe_run(sites, first.buffer, first.displacement, first.base, first.mask)
+    ctx.observe_run(sites, first.buffer, first.displacement, first.mask)
 
 
 def _runs(entries: list[Deferred]) -> list[list[Deferred]]:
