@@ -279,7 +279,7 @@ def cuda_program(seed: int) -> Program:
 REGISTERS = 6
 
 _PTX = """.version 8.8
-.target sm_75
+.target sm_90
 .address_size 64
 .visible .entry kernel(.param .u64 p0, .param .u64 p1, .param .u64 p2, .param .u64 p3, .param .u64 p4)
 {{
@@ -351,7 +351,17 @@ def ptx_program(seed: int) -> Program:
         if kind < 0.82:
             return f"and.b32 %k, {reg()}, {rng.choice((1, 2, 4))};\nsetp.ne.u32 {predicate()}, %k, 0;"
         if kind < 0.88:
-            return f"activemask.b32 {reg()};"
+            collective = rng.choice(
+                (
+                    f"mov.b32 {reg()}, %k;",
+                    f"vote.sync.ballot.b32 {reg()}, {predicate()}, %k;",
+                    f"vote.sync.any.pred {predicate()}, {predicate()}, %k;",
+                    f"match.any.sync.b32 {reg()}, {reg()}, %k;",
+                    f"redux.sync.add.s32 {reg()}, {reg()}, %k;",
+                    "bar.warp.sync %k;",
+                )
+            )
+            return f"activemask.b32 %k;\n{collective}"
         if kind < 0.94:
             place = f"and.b32 %k, {reg()}, 60;\ncvt.u64.u32 %w, %k;\nadd.s64 %w, %sums, %w;\n"
             return f"{place}{guard}red.global.add.u32 [%w], 3;"
@@ -361,17 +371,17 @@ def ptx_program(seed: int) -> Program:
         fuel = "add.s32 %fuel, %fuel, -1;\nsetp.lt.s32 %p3, %fuel, 0;\n@%p3 bra END;\n"
         guard = f"@{rng.choice(('', '!'))}%p{rng.randrange(3)} "
         kind = rng.random()
-        if kind < 0.6:
+        if kind < 0.55:
             return f"{fuel}{guard}bra B{rng.randrange(blocks)};"
-        if kind < 0.7:
+        if kind < 0.65:
             return f"{fuel}bra B{rng.randrange(blocks)};"
-        if kind < 0.85:
+        if kind < 0.78:
             targets = ", ".join(f"B{rng.randrange(blocks)}" for _ in range(3))
             table = f"T{number}: .branchtargets {targets};\n"
             return f"{fuel}rem.u32 %k, {reg()}, 3;\n{table}brx.idx %k, T{number};"
-        if kind < 0.92:
+        if kind < 0.84:
             return f"{fuel}{guard}exit;"
-        return fuel
+        return ""  # straight on into a block where others may wait
 
     body = []
     for number in range(blocks):

@@ -419,6 +419,10 @@ def test_global_requests_sectors_and_atomic_passes(body, expected):
         ("volatile __shared__ double s[64]; s[i] = 1;", {"sst_req": 1, "shm_wavefronts": 2}),
         ("__shared__ float4 s[64]; s[i] = make_float4(x[0], 1, 2, 3); __syncthreads(); x[i] = s[31 - i].x;",
          {"sst_req": 1, "sld_req": 1, "shm_wavefronts": 4 + 4, "bar": 1}),
+        ("__shared__ double s[2]; s[i & 1] = x[0]; __syncthreads(); x[i] = s[0];",
+         {"sst_req": 1, "sld_req": 1, "shm_wavefronts": 2 + 2}),
+        ("__shared__ float4 s[2]; s[i & 1] = make_float4(x[0], 1, 2, 3); __syncthreads(); float4 v = s[0]; "
+         "x[i] = v.x + v.y + v.z + v.w;", {"sst_req": 1, "sld_req": 1, "shm_wavefronts": 4 + 4}),
         ("volatile __shared__ unsigned char s[64]; s[i] = 1;", {"sst_req": 1, "shm_wavefronts": 1}),
         ("__shared__ float s[8]; atomicAdd(s + i % 8, 1.0f);", {"satom_req": 1, "satom_lane": 32, "satom_iter": 4}),
         ("__syncwarp(); __syncthreads(); __syncthreads();", {"bar": 2, "bar_warp": 1}),

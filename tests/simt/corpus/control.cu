@@ -142,6 +142,9 @@ KERNEL(control_memory) {
     __syncthreads();
     a = dynamic[blockDim.x - 1 - t];
     double2 d = pairs[t & 63];
+    dout[i * ROOM + 2] = pairs[t & 1].x + pairs[(t & 3) * 5].y;  // broadcasts of 8 and 16 bytes
+    double2 same = pairs[t >> 5 & 1];
+    dout[i * ROOM + 3] = same.x * same.y;
     ((float4*)(fout + i * ROOM))[0] = make_float4(a.w, a.z, b.x, b.y);
     ((double2*)(dout + i * ROOM))[0] = make_double2(d.y, d.x);
     ((uchar4*)(uout + i * ROOM))[0] = make_uchar4(bytes[t & 63], bytes[0], 1, 2);
