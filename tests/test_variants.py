@@ -27,6 +27,7 @@ NAMES = [variant.name for variant in VARIANTS]
 BLOCK_VARIANTS = [variant.name for variant in VARIANTS if variant.uses_blocks]
 SPLINES = AXES["spline"]
 COVERING_SEED = 1
+QUICK = {"writing": "literal"}  # where counts do not depend on the writing: rolled loops compile several times faster
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +137,7 @@ def test_global_node_has_a_thread_per_particle_and_node(counting) -> None:
 @pytest.mark.parametrize("blocks", ["active", "all"])
 def test_pull_has_no_atomics_and_stores_each_node_once(counting, blocks: str) -> None:
     dataset = crowded()
-    total = tally(counting, "p2g_block_pull", dataset, blocks=blocks)
+    total = tally(counting, "p2g_block_pull", dataset, blocks=blocks, **QUICK)
     assert total.gatom_req == total.satom_req == 0
     if blocks == "all":
         # A warp covers 8 x 4 nodes of one layer of a block; only layers past the last node of the grid store nothing.
@@ -153,12 +154,12 @@ def _thread_blocks(device, name: str, dataset, **axes) -> int:
 @pytest.mark.parametrize("batching", AXES["batching"])
 def test_sync_has_one_barrier_per_node_step_and_no_shared_atomics(counting, batching: int) -> None:
     dataset = crowded()
-    plan = make_plan(get("p2g_block_sync"), dataset, counting, batching=batching)
+    plan = make_plan(get("p2g_block_sync"), dataset, counting, batching=batching, **QUICK)
     plan.run_once(counting)
     maxima = np.asarray(counting.download(plan.work.block_maximum))
     rounds = sum(math.ceil(m / batching) for m in maxima)
     warps = 8 * 4 * 4 // 32
-    total = tally(counting, "p2g_block_sync", dataset, batching=batching)
+    total = tally(counting, "p2g_block_sync", dataset, batching=batching, **QUICK)
     assert total.satom_req == 0
     assert total.bar == warps * (plan.work.active_count + 64 * rounds)
 
@@ -166,11 +167,11 @@ def test_sync_has_one_barrier_per_node_step_and_no_shared_atomics(counting, batc
 @pytest.mark.parametrize("batching", AXES["batching"])
 def test_block_atomic_adds_in_shared_memory(counting, batching: int) -> None:
     dataset = crowded()
-    total = tally(counting, "p2g_block_atomic", dataset, batching=batching)
+    total = tally(counting, "p2g_block_atomic", dataset, batching=batching, **QUICK)
     cells = np.floor(dataset.node_units(np.float32)).astype(int)
     counts = np.unique(cells, axis=0, return_counts=True)[1]
     assert total.satom_lane == 64 * 4 * sum(math.ceil(c / batching) for c in counts)
-    blocks = _thread_blocks(counting, "p2g_block_atomic", dataset, batching=batching)
+    blocks = _thread_blocks(counting, "p2g_block_atomic", dataset, batching=batching, **QUICK)
     assert total.bar == 4 * 2 * blocks, "before and after the particles, never in between"
 
 
@@ -178,9 +179,9 @@ def test_block_atomic_adds_in_shared_memory(counting, batching: int) -> None:
                                                ("p2g_block_pull", "bar")])  # fmt: skip
 @pytest.mark.parametrize("batching", [2, 4, 8])
 def test_batching_divides_where_cells_are_full(counting, name: str, counter: str, batching: int) -> None:
-    # Counts do not depend on the writing, compile time does. For the pull, 8 staged particles per bin must fit.
-    axes: dict = {"writing": "literal"} | ({"block_shape": (2, 2, 2)} if name == "p2g_block_pull" else {})
-    dataset = filled(8, cells=(8, 4, 4))
+    # For the pull, 8 staged particles per bin must fit.
+    axes: dict = QUICK | ({"block_shape": (2, 2, 2)} if name == "p2g_block_pull" else {})
+    dataset = filled(8)
     single, batched = (
         getattr(tally(counting, name, dataset, batching=b, **axes), counter)
         - (_setup_barriers(counting, name, dataset, **axes) if counter == "bar" else 0)
@@ -195,8 +196,11 @@ def _setup_barriers(device, name: str, dataset, **axes) -> int:
     return math.ceil(threads / 32) * _thread_blocks(device, name, dataset, **axes)
 
 
-@pytest.mark.parametrize("name", [v.name for v in VARIANTS if len(v.axes["writing"]) > 1])
-@pytest.mark.parametrize("weights", AXES["weights"])
+@pytest.mark.parametrize(
+    ("name", "weights"),
+    [(v.name, "unity") for v in VARIANTS if len(v.axes["writing"]) > 1]
+    + [("p2g_block_sync", "plain"), ("g2p_block_gather", "plain")],
+)
 def test_literal_writing_is_not_optimised_into_the_hoisted_one(counting, name: str, weights: str) -> None:
     literal, hoisted = (
         tally(counting, name, filled(2), writing=w, weights=weights).lane_inst for w in ("literal", "hoisted")
@@ -207,7 +211,7 @@ def test_literal_writing_is_not_optimised_into_the_hoisted_one(counting, name: s
 @pytest.mark.parametrize("name", BLOCK_VARIANTS)
 def test_active_list_skips_empty_blocks(counting, name: str) -> None:
     dataset = filled(1)
-    launched = {b: _thread_blocks(counting, name, dataset, blocks=b) for b in ("active", "all")}
+    launched = {b: _thread_blocks(counting, name, dataset, blocks=b, **QUICK) for b in ("active", "all")}
     assert launched["all"] == math.prod(dataset.grid.blocks((8, 4, 4)))
     assert 0 < launched["active"] < launched["all"]
 
