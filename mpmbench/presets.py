@@ -1,4 +1,4 @@
-"""Named selections of cases: ``demo`` for a first look, ``thesis`` for every row of the thesis's tables 11-16."""
+"""Named selections of cases: ``demo`` for a first look, ``thesis`` for every row of the thesis's tables 5-16."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from mpmbench import primitives
 from mpmbench.dataset import DATASETS_FOLDER
 from mpmbench.errors import InputError
+from mpmbench.primitive_runs import PrimitiveCase
 from mpmbench.runner import Case, DatasetChoice
 from mpmbench.variants import Variant, discover, resolve_axes
 
-THESIS_TABLES = range(11, 17)
+PRIMITIVE_TABLES = range(5, 11)
+TRANSFER_TABLES = range(11, 17)
 
 # The columns of a published table that pin what a row executes; the ones left of them are the source's own.
 _DATASET_COLUMNS = ("dataset", "particles", "particles_per_cell")
@@ -26,17 +29,38 @@ def published_rows(table: int) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def thesis() -> list[Case]:
-    """Every row of tables 11-16 at full size, dataset by dataset so that each is loaded once."""
+def thesis() -> list[Case | PrimitiveCase]:
+    """Every row of tables 5-16 at full size: primitives, then transfers, dataset by dataset."""
     variants = {v.name: v for v in discover()}
     cases = [
-        _thesis_case(place, row, variants) for table in THESIS_TABLES for place, row in enumerate(published_rows(table))
+        _transfer_case(place, row, variants)
+        for table in TRANSFER_TABLES
+        for place, row in enumerate(published_rows(table))
     ]
     # Stable: within a dataset the rows keep the order of the tables.
-    return sorted(cases, key=lambda case: (case.dataset.name, case.dataset.particles_per_cell or 0))
+    cases.sort(key=lambda case: (case.dataset.name, case.dataset.particles_per_cell or 0))
+    known = {p.name: p for p in primitives.discover()}
+    return [
+        *(
+            _primitive_case(place, row, known)
+            for table in PRIMITIVE_TABLES
+            for place, row in enumerate(published_rows(table))
+        ),
+        *cases,
+    ]
 
 
-def _thesis_case(place: int, row: dict[str, str], variants: dict[str, Variant]) -> Case:
+def _primitive_case(place: int, row: dict[str, str], known: dict[str, primitives.Primitive]) -> PrimitiveCase:
+    """A row of tables 5-10: the columns right of ``size`` are axes."""
+    columns = list(row)
+    axes = columns[columns.index("size") + 1 :]
+    primitive = known[row["variant"]]
+    given = {name: row[name] for name in axes if row[name]}
+    published = _published(place, row, ("variant", "size", *axes))
+    return PrimitiveCase(primitive, int(row["size"]), primitives.resolve_axes(primitive, given), preset_row=published)
+
+
+def _transfer_case(place: int, row: dict[str, str], variants: dict[str, Variant]) -> Case:
     variant = variants[row["variant"]]
     given: dict[str, Any] = {"dtype": "float32", "spline": "cubic", "payload": "pic", "layout": "soa"}
     for name in _AXIS_COLUMNS:
@@ -47,8 +71,13 @@ def _thesis_case(place: int, row: dict[str, str], variants: dict[str, Variant]) 
         particles=int(row["particles"]),
         particles_per_cell=int(row["particles_per_cell"]) if row["particles_per_cell"] else None,
     )
-    # Printed figures go into the record as the source gives them; the pinning columns are in dataset and axes.
-    printed = {k: v for k, v in row.items() if k not in ("variant", *_DATASET_COLUMNS, *_AXIS_COLUMNS)}
+    published = _published(place, row, ("variant", *_DATASET_COLUMNS, *_AXIS_COLUMNS))
+    return Case(variant, choice, resolve_axes(variant, given), published)
+
+
+def _published(place: int, row: dict[str, str], pinning: Sequence[str]) -> dict[str, Any]:
+    """Printed figures go into the record as the source gives them; the pinning columns are in dataset and axes."""
+    printed = {k: v for k, v in row.items() if k not in pinning}
     preset_row: dict[str, Any] = {
         "source": "thesis",
         "table": int(printed.pop("table")),
@@ -59,7 +88,7 @@ def _thesis_case(place: int, row: dict[str, str], variants: dict[str, Variant]) 
         "erratum": printed.pop("erratum") or None,
     }
     printed.pop("speedup", None)
-    return Case(variant, choice, resolve_axes(variant, given), preset_row | {"published": printed})
+    return preset_row | {"published": printed}
 
 
 def demo() -> list[Case]:
@@ -83,10 +112,10 @@ def demo() -> list[Case]:
 
 DEMO_PARTICLES = 1_000_188
 
-PRESETS: dict[str, Callable[[], Sequence[Case]]] = {"demo": demo, "thesis": thesis}
+PRESETS: dict[str, Callable[[], Sequence[Case | PrimitiveCase]]] = {"demo": demo, "thesis": thesis}
 
 
-def preset(name: str) -> list[Case]:
+def preset(name: str) -> list[Case | PrimitiveCase]:
     """The cases of a preset by name."""
     if name not in PRESETS:
         raise InputError(f"unknown preset {name!r}: valid are {', '.join(PRESETS)}")

@@ -91,7 +91,7 @@ def test_npy_needs_a_grid(tmp_path):
 
 def test_dry_run_runs_nothing(tmp_path):
     out = invoke("run", "--preset", "thesis", "-d", "simulated", "--dry-run", "--json", tmp_path / "rows.jsonl")
-    assert "32 rows" in out
+    assert "54 rows" in out
     assert not (tmp_path / "rows.jsonl").exists()
 
 
