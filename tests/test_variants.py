@@ -13,7 +13,6 @@ import pytest
 from pairwise import covering_rows, pairs_of
 from transfers import crowded, filled, make_plan, transfer
 
-from mpmbench import api
 from mpmbench import device as devices
 from mpmbench.awkward import awkward_datasets
 from mpmbench.errors import InputError
@@ -337,19 +336,6 @@ def own_folder(tmp_path: Path) -> Path:
     kernel = (RAW_KERNELS / "p2g_global_atomic.cu").read_text()
     (tmp_path / "p2g_global_own.cu").write_text(kernel.replace("p2g_global_atomic", "p2g_global_own"))
     return tmp_path
-
-
-def test_a_folder_adds_a_variant_and_leaves_the_tree_alone(tmp_path: Path) -> None:
-    folder = own_folder(tmp_path)
-    package = Path(api.__file__).parent
-    before = {p: p.stat().st_mtime_ns for p in package.rglob("*") if p.suffix in (".py", ".cu", ".cuh")}
-    dataset = crowded()
-    own = api.p2g("p2g_global_own", dataset, variants=[str(folder)])
-    shipped = api.p2g("p2g_global_atomic", dataset)
-    np.testing.assert_array_equal(own.momentum, shipped.momentum)
-    assert "p2g_global_own" not in [variant.name for variant in discover()]
-    assert sorted(p.name for p in folder.iterdir()) == ["p2g_global_own.cu", "p2g_global_own.py"]
-    assert before == {p: p.stat().st_mtime_ns for p in package.rglob("*") if p.suffix in (".py", ".cu", ".cuh")}
 
 
 def test_a_bad_folder_gets_one_clear_line(tmp_path: Path) -> None:
