@@ -19,6 +19,7 @@ from mpmbench.grid import Grid
 
 if TYPE_CHECKING:
     from mpmbench.api import g2p, list_datasets, list_devices, list_variants, p2g
+    from mpmbench.gpu import list_gpus
     from mpmbench.record import load_records
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "g2p",
     "list_datasets",
     "list_devices",
+    "list_gpus",
     "list_variants",
     "load_dataset",
     "load_records",
@@ -37,7 +39,7 @@ __all__ = [
 ]
 
 _LAZY = {name: "mpmbench.api" for name in ("p2g", "g2p", "list_variants", "list_datasets", "list_devices")}
-_LAZY |= {"load_records": "mpmbench.record"}
+_LAZY |= {"load_records": "mpmbench.record", "list_gpus": "mpmbench.gpu"}
 
 
 def __getattr__(name: str) -> Any:
