@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, field, replace
 from mpmbench.errors import InputError
 from mpmbench.measure import SHORTEST_RANKED
 from mpmbench.record import Record
+from mpmbench.report import primitives
 from mpmbench.report import table as tables
 from mpmbench.report.plots import Bars, Line, Lines, logspace, thin
 from mpmbench.report.table import Group, Kind, Table
@@ -100,7 +101,8 @@ def build(records: Sequence[Record], extent: Extent = EXTENTS[0]) -> Document:
     if not records:
         raise InputError("no records to report: run something first")
     records = list(records)
-    groups = tables.group(records)
+    transfers = [record for record in records if record.is_transfer]
+    groups = tables.group(transfers)
     sections = [Section("Answer in one table", tuple(tables.summary(groups)))] if any(g.ranked for g in groups) else []
     if published := tables.presets(records):
         sections.append(Section("Published tables, and the same rows here", tuple(published)))
@@ -109,15 +111,16 @@ def build(records: Sequence[Record], extent: Extent = EXTENTS[0]) -> Document:
         _group_section(g, extent, charted=i < extent.charts, name_device=several_devices)
         for i, g in enumerate(groups[: extent.groups])
     ]
+    sections += [Section(name, (primitives.table(rows),)) for name, rows in primitives.groups(records).items()]
     sections.append(Section("Agreement with the float64 reference", (_untitled(tables.agreement(records)),)))
     for title, found in (
         ("Runs without a rank", tables.skipped(records)),
         ("Findings of the engine", tables.findings(records)),
-        ("Datasets: density and order", tables.datasets(records)),
+        ("Datasets: density and order", tables.datasets(transfers)),
         ("Kernels as compiled", tables.kernels(records)),
     ):
         if found:
-            more = tables.distributions(records) if title.startswith("Datasets") else []
+            more = tables.distributions(transfers) if title.startswith("Datasets") else []
             sections.append(Section(title, (_untitled(found), *more)))
     if extent.rows is not None:
         sections = [replace(s, tables=tuple(_shortened(t, extent.rows) for t in s.tables)) for s in sections]
@@ -132,7 +135,7 @@ def build(records: Sequence[Record], extent: Extent = EXTENTS[0]) -> Document:
         title="mpmbench report",
         verdict=verdict,
         agreed=agreed,
-        answer=tuple(_answer(groups)),
+        answer=tuple(_answer(groups, any(record.transfer_measurement for record in records))),
         attention=tuple(_attention(records, groups)),
         sections=tuple(sections),
         legend=_legend(sections),
@@ -188,10 +191,10 @@ def _plural(count: int, one: str, many: str = "") -> str:
     return f"{count:,} {one if count == 1 else many or one + 's'}"
 
 
-def _answer(groups: Sequence[Group]) -> list[str]:
+def _answer(groups: Sequence[Group], measured: bool) -> list[str]:
     sentences = []
     timed = [g for g in groups if not g.simulated and g.ranked]
-    if not timed:
+    if not measured:
         sentences.append(
             "No GPU took part: every number below is counted on a simulated device, exactly, and is not time. "
             "Run the same command where there is a GPU for times and speedups."
