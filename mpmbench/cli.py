@@ -1,4 +1,4 @@
-"""The command line: ``mpmbench list | run | check | report | selftest | doctor | env``.
+"""The command line: ``mpmbench list | run | check | report | verify | selftest | doctor | env``.
 
 Names and axis syntax follow NVBench. Exit codes: 0 ok, 1 harness error, 2 usage or bad input, 3 regression, 4 wrong
 results or findings, 130 interrupted.
@@ -376,6 +376,39 @@ def selftest(device: str | None, arch: str | None, quick: bool) -> None:
 
 
 @main.command()
+@click.option("--part", "parts", multiple=True, metavar="NAME", help="table3, table4 or drift; default: all.")
+@click.option("-d", "--device", default="simulated", metavar="DEVICE", help="simulated (default), cuda, cuda:N.")
+@click.option("--arch", default=None, metavar="sm_XX", help="Architecture the simulated device compiles for.")
+@click.option("--quick", is_flag=True, help="A smaller problem beside the printed figures: seconds, not minutes.")
+@click.option("--json", "json_path", type=click.Path(path_type=Path), metavar="FILE", help="Every figure and its kind.")
+@click.option("--md", "md_path", type=click.Path(path_type=Path), metavar="FILE", help="Markdown tables.")
+def verify(
+    parts: Sequence[str], device: str, arch: str | None, quick: bool, json_path: Path | None, md_path: Path | None
+) -> None:
+    """Errors of totals, added exactly, beside the thesis's tables 3 and 4; what weights=unity buys.
+
+    Exit code 4 if a bound does not hold.
+    """
+    from mpmbench import verify as verification
+    from mpmbench.environment import Environment
+
+    _refuse_folders([json_path, md_path])
+    opened = _open_devices([device], arch, "run")[0]
+    with _progress() as progress:
+        outcomes = verification.verify(opened, parts, quick, _step_by_step(progress))
+    click.echo(verification.text(outcomes))
+    environment = Environment.capture()
+    if json_path:
+        _write_whole(json_path, json.dumps(verification.to_json(outcomes, opened, environment), indent=2) + "\n")
+    if md_path:
+        _write_whole(md_path, verification.markdown(outcomes, opened, environment))
+    for path in filter(None, (json_path, md_path)):
+        console.print(f"wrote {path}", markup=False, soft_wrap=True)
+    if verification.problems(outcomes):
+        sys.exit(WRONG_RESULT)
+
+
+@main.command()
 def doctor() -> None:
     """What is present, what is missing, and what to do about it."""
     from mpmbench.doctor import diagnose
@@ -461,6 +494,30 @@ def _progress() -> Progress:
         console=notes,
         disable=not notes.is_terminal,
     )
+
+
+def _step_by_step(progress: Progress) -> Callable[[str, int, int], None]:
+    """A callback (what, steps done, steps in all) that shows one bar per thing that runs; tenths where nobody looks."""
+    tasks: dict[str, Any] = {}
+
+    def tick(what: str, done: int, total: int) -> None:
+        if what not in tasks:
+            for task in tasks.values():
+                progress.update(task, visible=False)
+            tasks[what] = progress.add_task(what, total=total)
+        progress.update(tasks[what], completed=done)
+        if not progress.console.is_terminal and (done == total or done % max(1, total // 10) == 0):
+            notes.print(f"[{done}/{total}] {what}", markup=False, soft_wrap=True)
+
+    return tick
+
+
+def _write_whole(path: Path, text: str) -> None:
+    """The whole text or nothing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text, encoding="utf-8")
+    os.replace(partial, path)
 
 
 def _refuse_folders(paths: Sequence[Path | None]) -> None:
