@@ -95,10 +95,8 @@ class _Generator:
     def _joinable(self) -> set[int]:
         """Segments at which lanes may wait for others."""
         result: set[int] = set()
-        for number, segment in enumerate(self.segments):
+        for segment in self.segments:
             last = self.kernel.instructions[segment.stop - 1]
-            if codegen_warp.gathers(last):
-                result.add(number)
             if last.root in _BRANCHES:
                 result.update(segment.successors)
         return result
@@ -184,7 +182,7 @@ class _Generator:
         )
 
     def _end(self) -> list[str]:
-        """The kernel's last code. Lanes that wait for others look once more, since lanes may have left meanwhile."""
+        """The kernel's last code. Lanes that wait for others now do so in vain."""
         if not any(codegen_warp.gathers(item) for item in self.kernel.instructions):
             return ["ended:", f"ret i32 {scheduler.STATUS_ENDED}"]
 
@@ -202,13 +200,6 @@ class _Generator:
             "end.all:",
             f"ret i32 {scheduler.STATUS_ENDED}",
             "end.waiting:",
-            *field("end.again", scheduler.CONTEXT_AGAIN),
-            "%end.first = icmp eq i32 %end.again, 0",
-            "br i1 %end.first, label %end.retry, label %end.stuck",
-            "end.retry:",
-            "store i32 1, ptr %end.again.at, align 4",
-            f"br label %{self.chain(0)}",
-            "end.stuck:",
             *field("end.status", scheduler.CONTEXT_STUCK),
             *field("end.segment", scheduler.CONTEXT_STUCK_SEGMENT),
             "%end.segment.wide = zext i32 %end.segment to i64",
@@ -740,7 +731,6 @@ class _Segment:
         w.store("i32", w.value(f"or i32 {waited}, {missing}"), waited_at, 4)
         w.emit(f"br label %{g.chain(n + 1)}")
         w.label(f"gathered{n}")
-        w.store("i32", "0", w.at("%context", scheduler.CONTEXT_AGAIN), 4)
         left = w.value(f"and i32 {elsewhere}, {waited}")  # dead, or they would be missing
         w.store("i32", w.value(f"and i32 {waited}, {w.value(f'xor i32 {arrived}, -1')}"), waited_at, 4)
         self.fault(w.value(f"icmp ne i32 {left}, 0"), status)

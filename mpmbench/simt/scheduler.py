@@ -60,9 +60,8 @@ CONTEXT_BARRIER = 28  # i32: segment of the barrier it waits at
 CONTEXT_WARP_EPOCH = 32  # i64: grows with every barrier that orders this warp's own lanes (debug)
 CONTEXT_REDUCTIONS = 40  # i64: reducing barriers that the warp has arrived at in this thread block
 CONTEXT_WAITED = 48  # i32: lanes that others have waited for and that have not come yet
-CONTEXT_AGAIN = 52  # i32: 1 while the lanes that wait look once more whether they can go on
-CONTEXT_STUCK = 56  # i32: status to end with if they cannot,
-CONTEXT_STUCK_SEGMENT = 60  # i32: and the segment where they wait
+CONTEXT_STUCK = 52  # i32: status to end with if those never come,
+CONTEXT_STUCK_SEGMENT = 56  # i32: and the segment where the others wait
 CONTEXT_TID = 64  # 3 x 32 x i32
 CONTEXT_SLOTS = CONTEXT_TID + 3 * 128  # what the code generator lays out: pending masks, registers
 
