@@ -263,6 +263,15 @@ def test_no_baseline_no_break_even_and_it_says_so():
 # ---- measured ----------------------------------------------------------------------------------------------------
 
 
+def test_no_winner_below_the_resolution_of_events():
+    quick = [measured(simulated("p2g_block_sync"), 6e-6, step=1e-6), measured(simulated(), 9e-6, step=1e-6)]
+    doc = document.build(quick)
+    assert any("too short to say which is fastest" in line for line in doc.answer)
+    assert not any(" use p2g" in line for line in doc.answer)
+    fastest = [t for t in all_tables(doc) if t.title == "Fastest transfer, measured"]
+    assert all(not t.rows for t in fastest)
+
+
 def test_measured_numbers():
     fast, slow = measured(simulated("p2g_block_sync"), 64e-6, step=1e-4), measured(simulated(), 640e-6, step=1e-4)
     (g,) = tables.group([slow, fast])

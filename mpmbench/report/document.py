@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 
 from mpmbench.errors import InputError
-from mpmbench.measure import SHORTEST_RANKED
+from mpmbench.measure import SHORTEST_RANKED, too_fast_to_rank
 from mpmbench.record import Record
 from mpmbench.report import primitives
 from mpmbench.report import table as tables
@@ -202,6 +202,9 @@ def _answer(groups: Sequence[Group], measured: bool) -> list[str]:
     for g in timed[:NAMED]:
         best, base = g.ranked[0], g.baseline
         assert best.transfer_measurement is not None
+        if too_fast_to_rank(best.transfer_measurement):
+            sentences.append(f"{g.title}, on {g.device}: too short to say which is fastest; use more particles.")
+            continue
         words = f"{g.title}, on {g.device}: use {g.label(best)}, {seconds_text(best.transfer_measurement.median)}"
         if base is not None and base is not best and base.transfer_measurement is not None:
             gain = base.transfer_measurement.median / best.transfer_measurement.median
@@ -254,7 +257,7 @@ def _attention(records: Sequence[Record], groups: Sequence[Group]) -> list[Atten
                 trouble = f"Kernel {kernel} spills {info['spill_bytes']} bytes of registers per thread to local memory"
                 note("warning", trouble, "A smaller block or less batching needs fewer registers.", where)
         if (time := r.transfer_measurement) is not None:
-            if time.median < SHORTEST_RANKED:
+            if too_fast_to_rank(time):
                 trouble = f"Too short for the resolution of events (below {seconds_text(SHORTEST_RANKED)})"
                 note("warning", trouble, "Do not rank by it; use more particles.", where)
             if time.noise > NOISY:

@@ -14,6 +14,7 @@ from enum import StrEnum
 from functools import cached_property
 from typing import Any
 
+from mpmbench.measure import too_fast_to_rank
 from mpmbench.record import PER_TRANSFER_STEPS, DatasetSummary, Record, StepCost, total_cost
 from mpmbench.simt.counters import SourceLine, Tally
 
@@ -822,6 +823,9 @@ def _summary_measured(groups: Sequence[Group]) -> Table:
     rows = []
     for g in groups:
         best, base = g.ranked[0], g.baseline
+        assert best.transfer_measurement is not None
+        if too_fast_to_rank(best.transfer_measurement):
+            continue
         time = seconds(transfer_cost(best))
         base_time = base and seconds(transfer_cost(base))
         speedup = base_time / time if base_time and time else None
