@@ -167,8 +167,18 @@ def destination(kind: str) -> str:
     return {"s8": "b32", "u8": "b32"}.get(kind, kind)
 
 
-def lanewise_kernel(cases: tuple[Case, ...], style: str) -> str:
-    """style ``guard``: each instruction under a predicate; ``branch``: all behind one branch."""
+def literal(kind: str, bits: int) -> str:
+    """A literal operand of a type with these (low) bits."""
+    size = numpy_ops.DTYPES[kind].itemsize
+    bits &= (1 << 8 * size) - 1
+    if kind in ("f32", "f64"):
+        return f"0{'f' if kind == 'f32' else 'd'}{bits:0{2 * size}X}"
+    return str(bits - (1 << 8 * size) if kind[0] == "s" and bits >> (8 * size - 1) else bits)
+
+
+def lanewise_kernel(cases: tuple[Case, ...], style: str, data: np.ndarray | None = None) -> str:
+    """style ``guard``: each instruction under a predicate; ``branch``: all behind one branch; ``literal``: its last
+    operand that can be one is a literal, the first thread's value in ``data``."""
     text = Text()
     body: list[tuple[Case, list[str], list[str]]] = []
     for number, case in enumerate(cases):
@@ -188,6 +198,10 @@ def lanewise_kernel(cases: tuple[Case, ...], style: str) -> str:
             text.add("sub.cc.u32 %junk, 0, %junk;" if root == "subc" else "add.cc.u32 %junk, %junk, -1;")
         has_carry = "cc" in case.opcode.split(".")
         shown = results[:-1] if has_carry else results
+        if style == "literal" and data is not None:
+            number = next(n for n, (other, _, _) in enumerate(body) if other is case)
+            slot = max(s for s, kind in enumerate(case.sources) if kind != "pred")
+            sources[slot] = literal(case.sources[slot], int(data[number, slot, 0]))
         immediates = [str(value) for value in case.immediates]
         text.add(f"{guard}{case.opcode} {', '.join(['|'.join(shown), *sources, *immediates])};")
         if has_carry:  # the flag read back as a number

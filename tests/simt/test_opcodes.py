@@ -35,14 +35,16 @@ def lanewise_batches() -> list:
     return [pytest.param(batch, id=f"{batch[0].form} to {batch[-1].form}") for batch in batches]
 
 
-@pytest.mark.parametrize("style", ["guard", "branch"])
+@pytest.mark.parametrize(("style", "lane_width"), [("guard", 16), ("branch", 8), ("literal", 32)])
 @pytest.mark.parametrize("cases", lanewise_batches())
-def test_lanewise_forms(cases, style):
-    data = opcodes.inputs(cases, seed=len(cases[0].form))
-    text = opcodes.lanewise_kernel(cases, style)
+def test_lanewise_forms(cases, style, lane_width):
+    if style == "literal":
+        cases = tuple(case for case in cases if len(case.sources) > 1 and set(case.sources) != {"pred"})
+    data = opcodes.inputs(cases, seed=len(style))
+    text = opcodes.lanewise_kernel(cases, style, data)
     want, got = (opcodes.launch_arguments(data, seed=1) for _ in range(2))
     run_oracle(text, want)
-    run_engine(text, got)
+    run_engine(text, got, lane_width)
     wrong = []
     for number, case in enumerate(cases):
         for slot in range(len(case.results)):
