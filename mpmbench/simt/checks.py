@@ -10,6 +10,8 @@ of them a write and not both atomic,
 - by different lanes of one warp, with neither a block barrier nor a warp barrier between them. Since Volta the lanes
   of a warp do not run in step, and shuffles, votes and matches do not order memory.
 
+Two stores of the same value to the same place are no race: whoever comes last, the outcome is the same.
+
 Uninitialised: a shared granule is read that its thread block has not written.
 
 The checker is compiled by numba and kept in numba's own cache.
@@ -40,7 +42,7 @@ _HEADER = 8
 _SITE_WORDS = 3  # kind, width, space: 1 shared, 2 any, 0 another
 
 # Shadow of a granule: the thread block that wrote it, then two slots for each kind of access.
-_SLOT_WORDS = 5  # epoch, warp, lanes, warp epoch, site
+_SLOT_WORDS = 6  # epoch, warp, lanes, warp epoch, site, what was stored
 _SHADOW_WORDS = 1 + 2 * 3 * _SLOT_WORDS
 
 _FINDING_WORDS = 6  # kind, site, other site, count, thread block, byte address (in shared memory: offset)
@@ -55,7 +57,7 @@ _JOB_WORDS = JOB_BYTES // 8
 _WARP, _WARP_EPOCH = CONTEXT_WARP // 8, CONTEXT_WARP_EPOCH // 8
 
 _WORD = types.CPointer(types.int64)
-_SIGNATURE = types.int32(_WORD, _WORD, _WORD, types.int64, types.int64, types.int32, _WORD, types.int64)
+_SIGNATURE = types.int32(_WORD, _WORD, _WORD, types.int64, types.int64, types.int32, _WORD, types.int64, _WORD)
 _UNBOUNDED = 1 << 40
 
 
@@ -110,11 +112,16 @@ def _inside(data, address, width):
 
 
 @_compiled
-def _conflict(data, slots, epoch, warp, lane, warp_epoch):
-    """-> (kind of conflict or 0, site) of an access with the earlier ones in a granule's two slots."""
+def _conflict(data, slots, epoch, warp, lane, warp_epoch, both_store, stored):
+    """-> (kind of conflict or 0, site) of an access with the earlier ones in a granule's two slots.
+
+    stored: stands for what a store writes.
+    """
     for number in range(2):
         at = slots + number * _SLOT_WORDS
         if data[at] != epoch:
+            continue
+        if both_store and data[at + 5] == stored:
             continue
         if data[at + 1] != warp:
             return _RACE, data[at + 4]
@@ -124,7 +131,7 @@ def _conflict(data, slots, epoch, warp, lane, warp_epoch):
 
 
 @_compiled
-def _remember(data, slots, epoch, warp, lane, warp_epoch, site):
+def _remember(data, slots, epoch, warp, lane, warp_epoch, site, stored):
     """Two different warps are enough to find every race with a third; of one warp, the lanes since its last barrier."""
     chosen = slots
     if data[slots] == epoch and data[slots + 1] != warp:
@@ -140,10 +147,11 @@ def _remember(data, slots, epoch, warp, lane, warp_epoch, site):
     data[chosen + 1] = warp
     data[chosen + 3] = warp_epoch
     data[chosen + 4] = site
+    data[chosen + 5] = stored
 
 
 @_compiled
-def _look_at_shared(data, job, offset, width, kind, site, warp, lane, warp_epoch):
+def _look_at_shared(data, job, offset, width, kind, site, warp, lane, warp_epoch, stored):
     block = job[_BLOCK]
     epoch = job[_EPOCH]
     shift = data[_GRANULE_SHIFT]
@@ -155,24 +163,26 @@ def _look_at_shared(data, job, offset, width, kind, site, warp, lane, warp_epoch
             if (kind == _LOAD and other == _LOAD) or (kind == _ATOMIC and other == _ATOMIC):
                 continue
             slots = shadow + 1 + 2 * _SLOT_WORDS * other
-            conflict, where = _conflict(data, slots, epoch, warp, lane, warp_epoch)
+            both_store = kind == _STORE and other == _STORE
+            conflict, where = _conflict(data, slots, epoch, warp, lane, warp_epoch, both_store, stored)
             if conflict == _HAZARD and where == site:
                 conflict = _CLASH  # two lanes store to one address in one instruction, or in turns of a loop
             if conflict:
                 _report(data, conflict, site, where, block, granule << shift)
         slots = shadow + 1 + 2 * _SLOT_WORDS * kind
-        _remember(data, slots, epoch, warp, lane, warp_epoch, site)
+        _remember(data, slots, epoch, warp, lane, warp_epoch, site, stored)
         if kind != _LOAD:
             data[shadow] = block + 1
 
 
 @_callback
-def _check(data_at, job_at, context_at, site, first_lane, bits, addresses_at, displacement):
+def _check(data_at, job_at, context_at, site, first_lane, bits, addresses_at, displacement, stored_at):
     """-> the lanes that may go on. addresses: of the chunk's lanes, the first of which is ``first_lane``."""
     data = carray(data_at, _UNBOUNDED)
     job = carray(job_at, _JOB_WORDS)
     context = carray(context_at, 64)
     addresses = carray(addresses_at, 32)
+    stored_values = carray(stored_at, 32)
     about = data[_SITES_AT] + site * _SITE_WORDS
     kind, width, may_be_shared = data[about], data[about + 1], data[about + 2]
     shared, shared_bytes = job[_SHARED_BASE], job[_SHARED_BYTES]
@@ -194,7 +204,11 @@ def _check(data_at, job_at, context_at, site, first_lane, bits, addresses_at, di
             if offset < 0 or offset + width > shared_bytes:
                 _report(data, _OUTSIDE, site, np.int64(-1), block, place)
                 continue
-            _look_at_shared(data, job, offset, width, kind, site, warp, first_lane + lane, warp_epoch)
+            stored = np.int64(0)
+            if kind == _STORE:
+                # The place belongs to it: equal vectors that overlap by half do not store the same.
+                stored = stored_values[lane] ^ (offset << 44)
+            _look_at_shared(data, job, offset, width, kind, site, warp, first_lane + lane, warp_epoch, stored)
         elif not _inside(data, address, width):
             _report(data, _OUTSIDE, site, np.int64(-1), block, place)
             continue

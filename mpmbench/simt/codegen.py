@@ -471,12 +471,6 @@ class SegmentBody:
 
     # --- counting and checking ---
 
-    def observe(self, site: Site, buffer: str, displacement: int, base: str) -> None:
-        if self.counts:
-            self.observe_run([site], buffer, displacement)
-            return
-        self._check(site, buffer, displacement, base)
-
     def observe_run(self, sites: list[Site], buffer: str, displacement: int, bits: str | None = None) -> None:
         """Count neighbouring accesses once all lanes have stored their addresses.
 
@@ -506,8 +500,8 @@ class SegmentBody:
         w.store(f"i{w.lanes}", narrow, at, w.lanes // 8)
         return memory
 
-    def _check(self, site: Site, buffer: str, displacement: int, base: str) -> None:
-        """Ask the checker which of the lanes may go on."""
+    def check(self, site: Site, buffer: str, displacement: int, base: str, fingerprints: str) -> None:
+        """Ask the checker which of the lanes may go on. fingerprints: of what the lanes store, or null."""
         w, g = self.w, self.g
         number = len(g.sites)
         g.sites.append(site)
@@ -518,7 +512,7 @@ class SegmentBody:
             absolute = w.value(f"add i64 {g.job_field('shared')}, {displacement}")
         passed = w.value(
             f"call i32 {checker}(ptr {data}, ptr %job, ptr %context, i64 {number}, i64 %lane.{self.number}, "
-            f"i32 {bits}, ptr {self.chunk_of(buffer)}, i64 {absolute})"
+            f"i32 {bits}, ptr {self.chunk_of(buffer)}, i64 {absolute}, ptr {fingerprints})"
         )
         narrow = passed if w.lanes == 32 else w.value(f"trunc i32 {passed} to i{w.lanes}")
         mask = w.value(f"bitcast i{w.lanes} {narrow} to {w.vector('i1')}")

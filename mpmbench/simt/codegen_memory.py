@@ -200,14 +200,35 @@ def _pointers(ctx: SegmentBody, place: Place, extra: int = 0) -> str:
     return w.value(f"getelementptr i8, ptr {place.base}, {w.vector('i64')} {vector}")
 
 
-def _account(ctx: SegmentBody, index: int, kind: str, access: Access, address: Address) -> None:
-    """Count the access, or check it: then only the lanes that pass go on."""
+def _account(
+    ctx: SegmentBody, index: int, kind: str, access: Access, address: Address, stored: Sequence[str] = ()
+) -> None:
+    """Count the access, or check it: then only the lanes that pass go on. stored: values that a store writes."""
     if not ctx.observes:
         return
     buffer, displacement, base, _, _ = _address_buffer(ctx, index, access.space, address)
     element = ELEMENT_BYTES[ELEMENT[access.kind]]
     site = Site(index, kind, access.space, access.width, element)
-    ctx.observe(site, buffer, displacement, base)
+    if ctx.counts:
+        ctx.observe_run([site], buffer, displacement)
+    else:
+        ctx.check(site, buffer, displacement, base, _fingerprints(ctx, stored, ELEMENT[access.kind]))
+
+
+def _fingerprints(ctx: SegmentBody, values: Sequence[str], element: str) -> str:
+    """Memory with a number per lane that stands for what it stores: lanes that store the same do not race."""
+    if not values:
+        return "null"
+    w, integer = ctx.w, integer_of(element)
+    total = w.splat_int("i64", 0)
+    for value in values:
+        bits = w.reinterpret(value, element, integer)
+        wide = bits if integer == "i64" else w.cast("zext", bits, integer, "i64")
+        total = w.binary("mul", "i64", total, w.splat_int("i64", 0x9E3779B97F4A7C15))
+        total = w.binary("add", "i64", total, wide)
+    memory = w.buffer(8 * WARP)
+    w.store(w.vector("i64"), total, memory, 64)
+    return memory
 
 
 # --- loads --------------------------------------------------------------------------------------------------------
@@ -349,7 +370,7 @@ def _store(ctx: SegmentBody, index: int, item: Instruction, access: Access, addr
     operands: Sequence[Operand | None] = source.items if isinstance(source, Vector) else [source]
     element = ELEMENT[access.kind]
     values = [ctx.read(operand, access.kind) for operand in operands if operand is not None]
-    _account(ctx, index, "store", access, address)
+    _account(ctx, index, "store", access, address, values)
     if access.count == 4 and access.width == 16:
         _store_quads(ctx, index, access, address, element, values)
     elif access.width in (1, 2):

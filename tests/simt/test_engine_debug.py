@@ -57,6 +57,21 @@ def test_two_lanes_must_not_store_to_one_address():
     assert "several lanes" in found[0].message
 
 
+def test_stores_of_one_value_are_no_race():
+    body = """(float2* o, float v) { __shared__ float2 s[2]; float* f = (float*)s;
+        s[0] = make_float2(v, v + 1.f); VALUE __syncthreads(); o[threadIdx.x] = s[0]; }"""
+    out = np.zeros((128, 2), np.float32)
+    assert kinds(body.replace("VALUE", ""), 128, out, np.float32(3)) == []
+    assert (out == [3, 4]).all()
+    assert "race" in kinds(body.replace("VALUE", "if (threadIdx.x == 77) f[1] = v;"), 128, out, np.float32(3))
+    overlapping = body.replace("VALUE", "if (threadIdx.x == 64) { f[1] = v; f[2] = v + 1.f; }")
+    assert "race" in kinds(overlapping, 128, out, np.float32(3))
+    signs = (
+        "(double* o) { __shared__ double s; s = threadIdx.x & 1 ? -1.0 : 1.0; __syncthreads(); o[threadIdx.x] = s; }"
+    )
+    assert "race" in kinds(signs, 32, np.zeros(32))
+
+
 def test_atomics_race_with_plain_accesses_only():
     body = """(int* o) { __shared__ int s; if (threadIdx.x == 0) s = 0; __syncthreads();
         atomicAdd(&s, 1); BARRIER o[threadIdx.x] = s; }"""
