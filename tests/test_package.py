@@ -39,7 +39,7 @@ def test_wheel_works_in_an_empty_directory(installed, tmp_path):
     assert "p2g_block_sync" in listed
     assert "splash" in listed
     thesis = _run([sys.executable, "-m", "mpmbench", "run", "--preset", "thesis", "--dry-run"], tmp_path, **env)
-    assert "32 rows" in thesis
+    assert "54 rows" in thesis
     words = ["run", "--quick", "-d", "simulated", "--html", "report.html"]
     out = _run([sys.executable, "-m", "mpmbench", *words], tmp_path, **env)
     assert "7 rows: 7 ok" in out
