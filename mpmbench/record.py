@@ -360,7 +360,7 @@ class RecordWriter:
     """Writes records to a JSON-lines file, each on disk before ``write`` returns.
 
     existing: what to do with a file that is already there: "refuse" it, "append" after its last whole row, or
-    "replace" it, which happens only when the first row is ready.
+    "replace" it, which happens only when the first row is on disk.
     """
 
     def __init__(self, path: str | Path, existing: Literal["refuse", "append", "replace"] = "refuse") -> None:
@@ -386,6 +386,8 @@ class RecordWriter:
             try:
                 from_json(text[end:].decode())
             except (ValueError, KeyError, TypeError):
+                if not _torn(text[end:]):
+                    raise InputError(f"{self.path}: its last line is not a record of mpmbench: remove it") from None
                 os.ftruncate(self._fd, end)
                 warnings.warn(f"{self.path}: dropped a torn last row before appending", stacklevel=3)
             else:
@@ -398,20 +400,33 @@ class RecordWriter:
         row = to_json(record).encode() + b"\n"
         try:
             if self._replace:
-                os.ftruncate(self._fd, 0)
-                self._replace = False
-            written = 0
-            while written < len(row):
-                written += os.pwrite(self._fd, row[written:], self._end + written)
-            os.fsync(self._fd)
+                self._start_over(row)
+            else:
+                _put(self._fd, row, self._end)
         except OSError as error:
-            os.ftruncate(self._fd, self._end)  # a shorter file needs no space: earlier rows stay whole
+            if not self._replace:
+                os.ftruncate(self._fd, self._end)  # a shorter file needs no space: earlier rows stay whole
             raise InputError(
                 f"cannot write row {self.rows + 1} to {self.path}: {_reason(error)}; earlier rows are intact,"
                 " make room and run again"
             ) from None
         self._end += len(row)
         self.rows += 1
+
+    def _start_over(self, row: bytes) -> None:
+        """Put a new file with this row in the place of the old one, which stays as it is if the disk is full."""
+        target = self.path.resolve()
+        beside = target.with_name(f".{target.name}.new")
+        new = os.open(beside, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
+        try:
+            _put(new, row, 0)
+            beside.replace(target)
+        except OSError:
+            os.close(new)
+            beside.unlink()
+            raise
+        os.close(self._fd)
+        self._fd, self._replace = new, False
 
     def close(self) -> None:
         if self._fd >= 0:
@@ -425,6 +440,20 @@ class RecordWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _put(fd: int, data: bytes, offset: int) -> None:
+    """Write all of ``data`` and wait until it is on disk."""
+    written = 0
+    while written < len(data):
+        written += os.pwrite(fd, data[written:], offset + written)
+    os.fsync(fd)
+
+
+def _torn(row: bytes) -> bool:
+    """Whether this can be the beginning of a record: any other text is somebody's, not ours to drop."""
+    begin = f'{{"{fields(Record)[0].name}":'.encode()
+    return row[: len(begin)] == begin[: len(row)]
 
 
 def read_records(path: str | Path) -> list[Record]:
@@ -447,7 +476,7 @@ def read_records(path: str | Path) -> list[Record]:
                 " use the version that wrote the file"
             ) from None
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            if row is last:  # rows end in a newline: this one was being written when the run ended
+            if row is last and _torn(row):  # rows end in a newline: this one was being written when the run ended
                 warnings.warn(f"{path}:{number}: dropped a torn last row", stacklevel=2)
                 continue
             raise InputError(

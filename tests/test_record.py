@@ -178,6 +178,7 @@ def test_an_existing_file_is_safe(tmp_path, simulated):
         ('{"a": 1}\n', ":1: not a record"),
         ("[]\n", ":1: not a record"),
         ("garbage\n", ":1: not a record"),
+        ("notes without a last newline", ":1: not a record"),
         ("\xff\n", ":1: not a record"),
         (f'{{"schema": {SCHEMA}}}\n', ":1: not a record"),
     ],
@@ -196,6 +197,34 @@ def test_an_unwritable_place_is_known_before_any_work(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot write records"):
         RecordWriter(tmp_path / "file" / "r.jsonl")
+
+
+def test_a_text_of_something_else_is_not_taken_for_a_torn_row(tmp_path):
+    path = tmp_path / "notes.txt"
+    path.write_text("notes")
+    with pytest.raises(InputError, match="not a record"):
+        RecordWriter(path, existing="append")
+    assert path.read_text() == "notes"
+
+
+def test_a_full_disk_leaves_the_file_that_was_to_be_replaced(tmp_path, simulated, monkeypatch):
+    path = tmp_path / "r.jsonl"
+    with RecordWriter(path) as writer:
+        writer.write(simulated)
+
+    def fill_up(fd: int, data: bytes, offset: int) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with RecordWriter(path, existing="replace") as writer:
+        with monkeypatch.context() as patch:
+            patch.setattr(record_module.os, "pwrite", fill_up)
+            with pytest.raises(InputError, match="earlier rows are intact"):
+                writer.write(simulated)
+        assert read_records(path) == [simulated]
+        assert list(tmp_path.iterdir()) == [path]
+        writer.write(simulated)  # room was made
+        writer.write(simulated)
+    assert read_records(path) == [simulated, simulated]
 
 
 def test_dishonest_records_cannot_be_made(simulated, measured):
