@@ -240,7 +240,7 @@ def _generate(name: str, recipe: dict[str, Any]) -> Dataset:
     velocity = 2 * uniform("velocity", n, 3) - 1
     affine = (2 * uniform("affine", n, 3, 3) - 1) / (4 * grid.dx)
     mass = (0.5 + uniform("mass", n)) / max(n, 1)
-    return Dataset(
+    dataset = Dataset(
         name,
         grid,
         position,
@@ -251,6 +251,11 @@ def _generate(name: str, recipe: dict[str, Any]) -> Dataset:
         seed=int(recipe["seed"]),
         recipe=recipe,
     )
+    if "moved_steps" not in recipe:
+        return dataset
+    from mpmbench.motion import after_steps  # which takes and makes datasets
+
+    return replace(after_steps(dataset, recipe["moved_steps"], dataset.seed or 0), order=recipe["order"])
 
 
 def _from_file(name: str, recipe: dict[str, Any]) -> Dataset:

@@ -31,7 +31,8 @@ def counts_of(dataset, dtype=np.float64):
 
 def test_every_recipe_is_listed_with_a_summary():
     assert NAMES == [
-        "clustered", "lattice", "one_cell", "random", "sheet", "splash", "uniform_cube", "uniform_cube_shuffled",
+        "clustered", "lattice", "one_cell", "random", "random_moved", "sheet", "splash", "uniform_cube",
+        "uniform_cube_shuffled",
     ]  # fmt: skip
     assert all(recipe.summary and "\n" not in recipe.summary for recipe in list_datasets())
 
@@ -40,6 +41,7 @@ def test_every_recipe_is_listed_with_a_summary():
 # uniform_cube also takes sine and cosine of 30 degrees and one cube root, none of which comes near a site's border.)
 FINGERPRINTS = {
     ("random", 1000): "62a7053c75c071c9175d58e2e1b610c2857058e99c1840d23c95db9fa7585266",
+    ("random_moved", 1000): "7b4248c11e577562835f7cb2d497c2090149bcee5085de154d7fc294356e87ed",
     ("uniform_cube", 1000): "bd18c66f5171c3add867f95bcc1961d79ed139cb2485491bb428e42eec588dbe",
     ("uniform_cube_shuffled", 1000): "7b211bd29ad3c522b3ac412806275a0310bfc66e5a11d932f87c8fa91b121abc",
     ("lattice", 1000): "f8bd93c6aed16118ff5268409df9e8f145c70827ffc33b8beac1ba3df0b9553b",

@@ -172,6 +172,8 @@ def test_motion_follows_its_seed_and_lies_between_order_and_disorder() -> None:
     assert first.fingerprint == again.fingerprint != other.fingerprint
     jumps = [d.statistics["mean_jump_cells"] for d in (in_bin_order(dataset), first, dataset)]
     assert jumps == sorted(jumps)
+    recipe = load_dataset("random_moved", 4000, grid_shape=(20, 20, 20))
+    assert recipe.fingerprint == after_steps(dataset, 10, dataset.seed or 0).fingerprint
     with pytest.raises(InputError, match="want steps >= 0 and 0 to 1 cells"):
         after_steps(dataset, 3, 1, courant=1.5)
 
