@@ -11,8 +11,9 @@ from dataclasses import asdict, dataclass, field, replace
 from mpmbench.errors import InputError
 from mpmbench.measure import SHORTEST_RANKED, too_fast_to_rank
 from mpmbench.record import Record
-from mpmbench.report import primitives
+from mpmbench.report import banks, primitives
 from mpmbench.report import table as tables
+from mpmbench.report.banks import BankPicture
 from mpmbench.report.plots import Bars, Line, Lines, logspace, thin
 from mpmbench.report.table import Group, Kind, Table
 from mpmbench.report.text import number, seconds_text
@@ -51,7 +52,7 @@ class Details:
 class Section:
     title: str
     tables: tuple[Table, ...] = ()
-    charts: tuple[Bars | Lines, ...] = ()
+    charts: tuple[Bars | Lines | BankPicture, ...] = ()
     details: tuple[Details, ...] = ()
     intro: str = ""
 
@@ -111,6 +112,10 @@ def build(records: Sequence[Record], extent: Extent = EXTENTS[0]) -> Document:
         _group_section(g, extent, charted=i < extent.charts, name_device=several_devices)
         for i, g in enumerate(groups[: extent.groups])
     ]
+    if found_patterns := banks.patterns(transfers):
+        pictures = tuple(map(banks.picture, found_patterns[:4])) if extent.charts else ()
+        title = "Shared-memory banks of the block kernels"
+        sections.append(Section(title, (banks.table(found_patterns),), pictures, intro=banks.EXPLANATION))
     sections += [Section(name, (primitives.table(rows),)) for name, rows in primitives.groups(records).items()]
     sections.append(Section("Agreement with the float64 reference", (_untitled(tables.agreement(records)),)))
     for title, found in (

@@ -9,6 +9,7 @@ from typing import Any
 import jinja2
 from markupsafe import Markup, escape
 
+from mpmbench.report.banks import BankPicture
 from mpmbench.report.document import KINDS, Document
 from mpmbench.report.plots import Bars, Lines, svg
 from mpmbench.report.table import Column, Kind, Quantity, Table
@@ -38,7 +39,7 @@ def anchor(title: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
 
-def _chart(chart: Bars | Lines) -> Markup:
+def _chart(chart: Bars | Lines | BankPicture) -> Markup:
     return Markup(svg(chart))
 
 

@@ -11,9 +11,12 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mpmbench.report.text import number
+
+if TYPE_CHECKING:
+    from mpmbench.report.banks import BankPicture
 
 INK = "#010101"
 RULE = "#020202"
@@ -57,7 +60,7 @@ class Lines:
 
 
 @lru_cache(maxsize=256)
-def svg(chart: Bars | Lines) -> str:
+def svg(chart: Bars | Lines | BankPicture) -> str:
     """An ``<svg>`` element. Kept, as a page that comes out too large is laid out again with less on it."""
     import matplotlib
 
@@ -77,7 +80,13 @@ def svg(chart: Bars | Lines) -> str:
         "path.simplify": True,
     }
     with matplotlib.rc_context(style):
-        return _bars(chart) if isinstance(chart, Bars) else _lines(chart)
+        if isinstance(chart, Bars):
+            return _bars(chart)
+        if isinstance(chart, Lines):
+            return _lines(chart)
+        from mpmbench.report.banks import draw
+
+        return draw(chart)
 
 
 def _bars(chart: Bars) -> str:
@@ -96,7 +105,7 @@ def _bars(chart: Bars) -> str:
     axes.set_xlim(0, 1.14 * top)
     axes.set_ylim(len(values) - 0.6, -0.9)
     axes.axis("off")
-    return _inline(figure, f"{chart.title}: {chart.axis}")
+    return inline(figure, f"{chart.title}: {chart.axis}")
 
 
 def _lines(chart: Lines) -> str:
@@ -133,14 +142,14 @@ def _lines(chart: Lines) -> str:
         loc="upper left", bbox_to_anchor=(-0.02, -0.5 / (plot_height - 0.62)), frameon=False, fontsize=9,
         labelspacing=0.35, borderpad=0, handlelength=2.6,
     )  # fmt: skip
-    return _inline(figure, f"{chart.title}: {chart.axis}")
+    return inline(figure, f"{chart.title}: {chart.axis}")
 
 
 def _fit(label: str) -> str:
     return label if len(label) <= LONGEST_LABEL else f"{label[: LONGEST_LABEL - 1]}…"
 
 
-def _inline(figure: object, label: str) -> str:
+def inline(figure: object, label: str) -> str:
     """SVG text fit to stand inside an HTML page, described for those who cannot see it."""
     from html import escape
 
