@@ -297,7 +297,7 @@ def run(
     cases = _choose(**selection, quick=quick, preset_name=preset_name)
     if resume and json_path is None:
         raise InputError("--resume needs --json FILE, the file whose rows it keeps")
-    _refuse_folders([json_path, html_path, md_path, csv_path])
+    _refuse_targets([json_path, html_path, md_path, csv_path], selection["datasets"])
     # The thesis measured a GTX 970: its rows are counted on the code that NVRTC makes for that GPU.
     opened = _open_devices(devices, arch or ("sm_52" if preset_name == "thesis" else None), "count")
     if dry_run:
@@ -322,6 +322,7 @@ def check(
 ) -> None:
     """Hold variants to the float64 reference, without counting or timing. Exit code 4 if one fails."""
     cases = _choose(**selection, quick=quick)
+    _refuse_targets([json_path], selection["datasets"])
     opened = _open_devices(devices, arch, "debug" if debug else "run")
     records = _run_cases(cases, opened, json_path, "replace", quick)
     for record in records:
@@ -347,7 +348,7 @@ def report(records: Sequence[Path], html_path: Path | None, md_path: Path | None
     rows = [row for path in records for row in read_records(path)]
     if not rows:
         raise InputError(f"no records in {', '.join(map(str, records))}: nothing to report")
-    _refuse_folders([html_path, md_path, csv_path])
+    _refuse_targets([html_path, md_path, csv_path], records)
     if html_path or md_path or csv_path:
         _write_reports(rows, html_path, md_path, csv_path)
         for path in filter(None, (html_path, md_path, csv_path)):
@@ -392,7 +393,7 @@ def verify(
     from mpmbench import verify as verification
     from mpmbench.environment import Environment
 
-    _refuse_folders([json_path, md_path])
+    _refuse_targets([json_path, md_path])
     opened = _open_devices([device], arch, "run")[0]
     with _progress() as progress:
         outcomes = verification.verify(opened, parts, quick, _step_by_step(progress))
@@ -441,15 +442,14 @@ def _run_cases(cases: list[Any], devices: list[Any], json_path: Path | None, exi
     from mpmbench.environment import Environment
     from mpmbench.primitive_runs import PrimitiveCase
     from mpmbench.record import RecordWriter, read_records
-    from mpmbench.runner import Inputs, resume_key, run_case
+    from mpmbench.runner import Inputs, refuse_bad_input, resume_key, run_case
 
     # SIGTERM ends a run as Ctrl-C does: the row in flight is lost, the others are on disk.
     signal.signal(signal.SIGTERM, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
     kept: dict[Any, Any] = {}
     if json_path is not None and existing == "append" and json_path.exists():
         kept = {resume_key(record): record for record in read_records(json_path)}
-    for choice in dict.fromkeys(case.dataset for case in cases if not isinstance(case, PrimitiveCase)):
-        choice.load()  # bad input is refused before any file is touched and before an hour of work
+    refuse_bad_input(case for case in cases if not isinstance(case, PrimitiveCase))
     environment = Environment.capture()
     sampling = measure.QUICK if quick else None
     records: list[Any] = []
@@ -520,10 +520,17 @@ def _write_whole(path: Path, text: str) -> None:
     os.replace(partial, path)
 
 
-def _refuse_folders(paths: Sequence[Path | None]) -> None:
+def _refuse_targets(paths: Sequence[Path | None], inputs: Iterable[str | Path] = ()) -> None:
+    """Refuse to write into a folder or a device, to write two things into one file, or over what is read."""
+    taken = {Path(path).resolve(): "is read by the same command" for path in inputs}
     for path in filter(None, paths):
         if path.is_dir():
             raise InputError(f"{path} is a folder: name a file in it")
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path} is not an ordinary file: name another one")
+        if problem := taken.get(path.resolve()):
+            raise InputError(f"{path} {problem}: name another file to write to")
+        taken[path.resolve()] = "is written by the same command"
 
 
 def _write_reports(records: list[Any], html: Path | None, md: Path | None, csv: Path | None) -> None:

@@ -7,6 +7,8 @@ particles. Everything a user can get wrong is one ``InputError`` line.
 from __future__ import annotations
 
 import hashlib
+import math
+import textwrap
 import tomllib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,6 +21,7 @@ import numpy as np
 from mpmbench import density, particle_file, recipes
 from mpmbench.errors import InputError
 from mpmbench.grid import Grid
+from mpmbench.launcher import INT32_LIMIT
 from mpmbench.spline import Spline, get_spline
 
 # A link to the top-level folder in a checkout, a plain folder in a wheel.
@@ -123,14 +126,19 @@ class Dataset:
         """(n, 3) xi = (x - origin) / dx as kernels compute it: inputs and each operation rounded to ``dtype``."""
         real = np.dtype(dtype).type
         origin = np.array(self.grid.origin, dtype=real)
-        return (self.position.astype(real) - origin) * real(1 / self.grid.dx)
+        with np.errstate(over="ignore", invalid="ignore"):  # what does not fit is not finite, so outside any grid
+            return (self.position.astype(real) - origin) * real(1 / self.grid.dx)
 
     def check_support(self, spline: str | Spline, dtype: Any = np.float32) -> None:
-        """Raise InputError naming the first particle whose support leaves the grid in ``dtype`` arithmetic."""
+        """Raise InputError naming the first particle whose support leaves the grid in ``dtype`` arithmetic.
+
+        So does a particle whose mass or momentum ``dtype`` cannot hold.
+        """
         spline = get_spline(spline)
-        node = spline.bin_node(self.node_units(dtype))
+        with np.errstate(invalid="ignore"):
+            node = spline.bin_node(self.node_units(dtype))
         last = np.array(self.grid.shape) - 1
-        outside = ((node < spline.left) | (node + spline.right > last)).any(axis=1)
+        outside = ((node < spline.left) | (node > last - spline.right)).any(axis=1)
         if outside.any():
             p = int(np.argmax(outside))
             origin, dx = np.array(self.grid.origin), self.grid.dx
@@ -141,6 +149,29 @@ class Dataset:
                 f"{_triple(low)} <= x < {_triple(high)} m in which {spline.name} support stays on the grid "
                 f"{self.grid.shape}: move it or enlarge the grid"
             )
+        self._check_range(np.dtype(dtype))
+
+    def _check_range(self, dtype: np.dtype) -> None:
+        """Raise InputError where ``dtype`` cannot hold a mass, or all mass or momentum if they met at one node."""
+        least, most = float(np.finfo(dtype).tiny), float(np.finfo(dtype).max)
+        advice = f"rescale the units{' or take dtype=float64' if dtype.itemsize < 8 else ''}"
+        if self.particle_count and self.mass.min() < least:
+            p = int(np.argmin(self.mass))
+            raise InputError(
+                f"dataset {self.name!r}: mass of particle {p} is {self.mass[p]:g} kg, "
+                f"less than the smallest normal number of {dtype}, {least:.3g}: {advice}"
+            )
+        with np.errstate(over="ignore", invalid="ignore"):
+            # Within a support, a node is at most two spacings away.
+            speed = np.abs(self.velocity).max(axis=1) + 2 * self.grid.dx * np.abs(self.affine).sum(axis=2).max(axis=1)
+            momentum = np.maximum(self.mass, 1) * speed  # at least the speed: that must fit too
+            for amounts, what in ((self.mass, "mass"), (momentum, "momentum")):
+                if not amounts.sum() <= most:
+                    p = int(np.argmax(amounts))
+                    raise InputError(
+                        f"dataset {self.name!r}: the {what} of all particles is more than {dtype} can hold, "
+                        f"{most:.3g}; most is in particle {p}: {advice}"
+                    )
 
 
 def make_grid(shape: Any, dx: Any, origin: Any, where: str) -> Grid:
@@ -148,15 +179,26 @@ def make_grid(shape: Any, dx: Any, origin: Any, where: str) -> Grid:
     try:
         nodes = tuple(int(n) for n in shape)
         whole = all(float(n) == m for n, m in zip(shape, nodes, strict=True))
-        spacing, corner = float(dx), tuple(float(c) for c in origin)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"dataset {where!r}: grid shape {shape!r}, dx {dx!r}, origin {origin!r}: {error}") from None
+    except (TypeError, ValueError, OverflowError):
+        nodes, whole = (), False
     if len(nodes) != 3 or not whole or min(nodes) < 1:
-        raise InputError(f"dataset {where!r}: grid shape {shape!r} must be three positive whole numbers of nodes")
-    if not (np.isfinite(spacing) and spacing > 0):
-        raise InputError(f"dataset {where!r}: dx is {spacing:g} m; it must be positive and finite")
+        raise InputError(f"dataset {where!r}: grid shape {_short(shape)} must be three positive whole numbers of nodes")
+    if math.prod(nodes) >= INT32_LIMIT:
+        raise InputError(
+            f"dataset {where!r}: grid shape {nodes} has 2^31 nodes or more, kernels number them in 31 bits"
+        )
+    try:
+        spacing = float(dx)
+    except (TypeError, ValueError):
+        raise InputError(f"dataset {where!r}: dx is {_short(dx)}; it must be one number [m]") from None
+    if not (np.isfinite(spacing) and spacing > 0 and math.isfinite(1 / spacing)):
+        raise InputError(f"dataset {where!r}: dx is {spacing:g} m; it must be positive and finite, and so must 1 / dx")
+    try:
+        corner = tuple(float(c) for c in origin)
+    except (TypeError, ValueError):
+        corner = ()
     if len(corner) != 3 or not np.isfinite(corner).all():
-        raise InputError(f"dataset {where!r}: origin {origin!r} must be three finite numbers [m]")
+        raise InputError(f"dataset {where!r}: origin {_short(origin)} must be three finite numbers [m]")
     return Grid((nodes[0], nodes[1], nodes[2]), spacing, (corner[0], corner[1], corner[2]))
 
 
@@ -302,6 +344,12 @@ def _array(value: Any, label: str, where: str) -> np.ndarray:
     if array.dtype.kind not in "fiu":
         raise InputError(f"{where}: {label} has dtype {array.dtype}, want real numbers")
     return np.array(array, dtype=np.float64, order="C")
+
+
+def _short(value: Any) -> str:
+    """What a user gave, on one line of bounded length."""
+    value = value.tolist() if isinstance(value, np.ndarray) and value.size <= 9 else value
+    return textwrap.shorten(repr(value), 60, placeholder=" ...")
 
 
 def _triple(values: Iterable[float]) -> str:

@@ -19,8 +19,8 @@ def statistics(xi: np.ndarray, grid: Grid) -> dict[str, Any]:
     bins of powers of two ("3-4": cells with 3 or 4 particles).
     """
     cell = np.floor(xi).astype(np.int64)
-    counts = np.bincount(np.ravel_multi_index(tuple(cell.T), grid.shape)) if len(cell) else np.zeros(0, np.int64)
-    counts = counts[counts > 0]
+    # Sorted, not counted into an array of all cells: a grid may be far larger than what its particles fill.
+    counts = np.unique(np.ravel_multi_index(tuple(cell.T), grid.shape), return_counts=True)[1]
     blocks = np.unique(np.ravel_multi_index(tuple((cell // BLOCK_SHAPE).T), grid.blocks(BLOCK_SHAPE)))
     step = np.abs(np.diff(cell, axis=0)).max(axis=1, initial=0)
     jump = np.linalg.norm(np.diff(xi, axis=0), axis=1)

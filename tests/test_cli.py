@@ -145,6 +145,8 @@ def test_missing_and_malformed_files(tmp_path):
     [
         ({"position": np.full((4, 3), np.nan)}, "particle 0"),
         ({"position": np.full((4, 3), 7.0)}, "outside"),
+        ({"position": np.full((4, 3), 0.06)}, "cubic support"),  # in the grid, but not with all its nodes
+        ({"velocity": np.full((4, 3), 1e300)}, "momentum"),
         ({"velocity": np.zeros((3, 3))}, "(4, 3)"),
         ({"velocity": np.array([["a"] * 3] * 4)}, "velocity"),
         ({"mass": -1.0}, "mass"),
@@ -175,6 +177,23 @@ def test_nothing_is_overwritten_by_a_refused_run(tmp_path):
 
 def test_folder_in_place_of_a_file(tmp_path):
     assert "folder" in refusal("run", *SMALL, "--html", tmp_path)
+
+
+def test_no_output_may_hit_an_input_a_device_or_another_output(tmp_path):
+    rows, page = tmp_path / "rows.jsonl", tmp_path / "page.html"
+    particles = tmp_path / "mine.npz"
+    position = np.full((4, 3), 0.5)
+    np.savez(particles, position=position, velocity=position, mass=1.0, grid_shape=(8, 8, 8), dx=1 / 8)
+    before = particles.read_bytes()
+    line = refusal("run", "--dataset", particles, "-d", "simulated", "--json", particles)
+    assert "is read by the same command" in line
+    assert particles.read_bytes() == before
+    assert "is written by the same" in refusal("run", *SMALL, "--json", rows, "--html", rows)
+    assert "not an ordinary file" in refusal("run", *SMALL, "--html", "/dev/null")
+    invoke("run", *SMALL, "-b", "p2g_global_atomic", "--json", rows, "--html", page)
+    before = rows.read_bytes()
+    assert "is read by the same command" in refusal("report", rows, "--html", rows)
+    assert rows.read_bytes() == before
 
 
 def test_full_disk(tmp_path, monkeypatch):

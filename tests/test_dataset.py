@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 import zipfile
 
 import numpy as np
@@ -262,6 +263,12 @@ def test_fingerprint_sees_every_array_and_the_grid():
         ({"grid_shape": (9, 10)}, "must be three positive whole numbers"),
         ({"grid_shape": (9, 10, 11.5)}, "must be three positive whole numbers"),
         ({"grid_shape": "big"}, "grid shape 'big'"),
+        ({"grid_shape": (9, 10, np.inf)}, "must be three positive whole numbers"),
+        ({"grid_shape": np.ones((3, 3))}, "must be three positive whole numbers"),
+        ({"grid_shape": (2**62,) * 3}, r"2\^31 nodes or more"),
+        ({"dx": np.ones(3)}, "must be one number"),
+        ({"dx": 1e-310}, "so must 1 / dx"),
+        ({"origin": 0.0}, "three finite numbers"),
         ({"dx": -1}, "dx is -1 m; it must be positive and finite"),
         ({"dx": np.nan}, "dx is nan m"),
         ({"origin": (0, 0, np.inf)}, "three finite numbers"),
@@ -306,6 +313,34 @@ def test_support_is_judged_in_the_dtype_of_the_kernel():
     dataset.check_support("cubic", np.float64)
     with pytest.raises(InputError, match="particle 0"):
         dataset.check_support("cubic", np.float32)
+
+
+@pytest.mark.parametrize(
+    ("label", "value", "message"),
+    [
+        ("velocity", 1e39, "momentum of all particles .* float32 .* particle 2"),
+        ("affine", 1e39, "momentum of all particles"),
+        ("mass", 1e39, "mass of all particles .* particle 2"),
+        ("mass", 1e-39, "mass of particle 2 is 1e-39 kg, less than"),
+    ],
+)
+def test_what_a_number_type_cannot_hold_is_refused(label, value, message):
+    given = arrays()
+    given[label] = given[label].copy()
+    given[label][2] = value
+    dataset = Dataset.from_arrays(**given)
+    dataset.check_support("linear", np.float64)
+    with pytest.raises(InputError, match=message):
+        dataset.check_support("linear", np.float32)
+
+
+def test_statistics_need_no_memory_for_empty_cells():
+    given = arrays() | {"grid_shape": (1200, 1200, 1200)}  # 14 GB if every cell had a count
+    tracemalloc.start()
+    statistics = Dataset.from_arrays(**given).statistics
+    assert tracemalloc.get_traced_memory()[1] < 1e6
+    tracemalloc.stop()
+    assert sum(statistics["histogram"].values()) == statistics["occupied_cells"]
 
 
 # --- files ------------------------------------------------------------------------------------------------------------
@@ -369,6 +404,11 @@ def test_bad_files(tmp_path):
     refused(tmp_path / "zip.npz", "lacks position, velocity, mass")
     np.save(tmp_path / "objects.npy", np.array([{}, 1], dtype=object), allow_pickle=True)
     refused(tmp_path / "objects.npy", "is not a readable .npy of plain numbers")
+    with (tmp_path / "giant.npy").open("wb") as file:  # only the head of far more rows than any memory holds
+        np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (10**14, 7)})
+    refused(tmp_path / "giant.npy", "is not a readable .npy")
+    (tmp_path / "text.npz").write_text("x,y,z")
+    refused(tmp_path / "text.npz", "something else")
     (tmp_path / "folder.npz").mkdir()
     refused(tmp_path / "folder.npz", "is not a readable .npz")
     given = arrays()
