@@ -12,7 +12,7 @@ from bank_model import of_threads, run_on
 import mpmbench
 from mpmbench import device as devices
 from mpmbench.kernel import RAW_KERNELS
-from mpmbench.operations import scan
+from mpmbench.operations import block_scan, scan
 from mpmbench.primitives import Bench, discover, get, resolve_axes
 from mpmbench.primitives.scan_lookback import SEGMENT, lookback, state_length
 
@@ -208,3 +208,34 @@ def test_best_form_moves_little_more_than_it_must(counting, values) -> None:
     length = 2**18
     _, counters = run_on(counting, get("scan_lookback"), values[:length])
     assert 1 <= 32 * counters.total.sectors / scan.floor({}, length) < 1.05
+
+
+# --- inside blocks ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(8, 4, 4), (3, 5, 2), (1, 1, 1), (2, 8, 8), (1, 40, 2)], ids=str)
+def test_block_scan_from_the_grids_scan(device, shape) -> None:
+    """Against the definition, cell by cell, on a grid that blocks do not divide."""
+    primitive = get("block_scan_rows")
+    grid = block_scan.grid_of(13 * 13 * 17)
+    assert grid.shape == (14, 14, 14)
+    axes = resolve_axes(primitive, {"block_shape": shape})
+    inputs = block_scan.inputs(axes, grid.node_count, SEED)
+    built = primitive.build(Bench(primitive, axes, grid.node_count, inputs, device))
+    for launch in built.launches:
+        device.launch(launch)
+    counts = inputs["counts"].reshape(grid.shape)  # z, y, x
+    running: dict[tuple[int, ...], int] = {}
+    expected = np.zeros_like(counts)
+    for z, y, x in np.ndindex(grid.shape):  # inside a block this is its own order
+        block = (z // shape[2], y // shape[1], x // shape[0])
+        expected[z, y, x] = running.get(block, 0)
+        running[block] = int(expected[z, y, x] + counts[z, y, x])
+    result = built.outputs["block_scanned"]
+    np.testing.assert_array_equal(result.reshape(grid.shape), expected)
+    assert block_scan.check(inputs, {"block_scanned": result}, axes).passed
+    assert not block_scan.check(inputs, {"block_scanned": result + (np.arange(len(result)) == 99)}, axes).passed
+
+
+def test_a_block_of_too_many_threads_says_so() -> None:
+    assert "2048 cells" in (block_scan.requires({"block_shape": (16, 16, 8)}) or "")
