@@ -17,7 +17,7 @@ from mpmbench.spline import get_spline
 from mpmbench.variants import get
 
 REACH = {"linear": 1, "quadratic": 2, "cubic": 3}
-SHAPES = [(8, 4, 4), (4, 4, 4), (8, 8, 4), (4, 4, 2), (4, 8, 2), (2, 4, 4), (8, 2, 2)]
+SHAPES = [(8, 4, 4), (4, 4, 4), (8, 8, 4), (4, 4, 2), (4, 8, 2), (2, 4, 4), (8, 2, 2), (2, 2, 8), (1, 2, 16), (3, 5, 2)]
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +51,10 @@ def test_closed_form_is_what_addresses_give(shape, spline: str, double: bool) ->
     assert pattern.arena == tuple(edge + REACH[spline] for edge in shape)
     assert pattern.step_wavefronts == step_by_addresses(shape, spline, double)
     assert pattern.step_wavefronts >= pattern.least_wavefronts
+    ax, ay = (edge + REACH[spline] for edge in shape[:2])
+    first = [(z * ay + y) * ax + x for x, y, z in cells_of(shape)[:32]]
+    pieces = [2 * place + piece for place in first for piece in (0, 1)] if double else first
+    assert pattern.accesses(0).tolist() == [sum(piece % 8 == group for piece in pieces) for group in range(8)]
     last = (REACH[spline],) * 3
     assert pattern.step_wavefronts == step_by_addresses(shape, spline, double, last), "a shift changes nothing"
 

@@ -39,6 +39,20 @@ def test_values_arrive_whatever_the_layout(device, record: str, layout: str) -> 
         assert check.passed, f"{size}: {check}"
 
 
+def test_check_sees_one_wrong_length() -> None:
+    axes = resolve_axes(get("map_length"), {"used": 2})
+    inputs = MAP.inputs(axes, 50, SEED)
+    right = {
+        result: np.linalg.norm(inputs[name].astype(np.float64), axis=1)
+        for result, name in (("speeds", "velocity"), ("distances", "position"))
+    }
+    assert MAP.check(inputs, right, axes).passed
+    for result in right:
+        for factor in (1 + 1e-6, np.nan):
+            wrong = right | {result: right[result] * np.where(np.arange(50) == 17, factor, 1)}
+            assert not MAP.check(inputs, wrong, axes).passed
+
+
 def test_no_record_is_no_launch(device) -> None:
     check, counters = run(device, 0)
     assert check.passed
