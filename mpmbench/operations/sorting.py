@@ -4,8 +4,8 @@
 sorted order, as an index or by moving every attribute.  ``sort``: all of it, from positions (or keys) to the order.
 
 The particles lie at random in a cubic grid of as many bins as table 9 has for its million: half a particle per bin.
-How they lie in memory is an axis: ``random``; ``moved``, ten steps of motion within the CFL condition after a sort; and
-``sorted``.
+How they lie in memory is an axis: ``random``; ``after_10`` and ``after_1``, so many steps of motion within the CFL
+condition after a sort; and ``sorted``.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from mpmbench.recipes import MARGIN, Uniform
 from mpmbench.spline import get_spline
 from mpmbench.workspace import NEUTRAL, domain_value
 
-ORDERS = ("random", "moved", "sorted")
-MOVED_STEPS = 10
+STEPS = {"after_10": 10, "after_1": 1, "sorted": 0}  # since the last sort
+ORDERS = ("random", *STEPS)
 ATTRIBUTES = (8, 1, 2, 3, 4, 5, 6, 7)
 LAYOUTS = ("soa", "aos")
 SPLINE = "cubic"
@@ -51,9 +51,9 @@ def particles_of(order: str, size: int, seed: int) -> Dataset:
     # Positions that float32 holds: the kernels and their reference see the same.
     position = (grid.dx * xi).astype(np.float32).astype(np.float64)
     dataset = Dataset("random", grid, position, np.zeros((size, 3)), np.zeros((size, 3, 3)), np.ones(size))
-    if order == "sorted":
-        return in_bin_order(dataset, SPLINE)
-    return after_steps(dataset, MOVED_STEPS, seed) if order == "moved" else dataset
+    if order == "random":
+        return dataset
+    return after_steps(dataset, STEPS[order], seed) if STEPS[order] else in_bin_order(dataset, SPLINE)
 
 
 def keys_of(dataset: Dataset) -> np.ndarray:

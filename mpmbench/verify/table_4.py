@@ -76,13 +76,16 @@ def run(device: Device, quick: bool, tick: Tick) -> Outcome:
     lasted = []
     runs = [(p, w, max(2, trips // QUICK_DIVISOR) if quick else trips) for p, w, trips in RUNS]
     for payload, weights, trips in runs:
-        started = time.perf_counter()
+        started, used = time.perf_counter(), time.process_time()
         pair = RoundTrip(
             dataset, device, "p2g_block_sync", "g2p_block_gather", {**strategy, "payload": payload, "weights": weights}
         )
         drifts, last_nodes, start = round_trips(pair, trips, tick)
         history += drifts
-        lasted.append(f"{payload} weights={weights} {trips:,} trips {time.perf_counter() - started:.0f} s")
+        lasted.append(
+            f"{payload} weights={weights} {trips:,} trips {time.perf_counter() - started:.0f} s "
+            f"(processor {time.process_time() - used:.0f} s)"
+        )
         sums = sums or _sums(last_nodes, start, pair.node_totals())
     kind = own_kind(device)
     return Outcome(
