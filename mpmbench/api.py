@@ -54,6 +54,10 @@ def _transfer(
     transfer: str, name: str, dataset: Dataset, nodes: Nodes | None, device_name: str, arch: str | None,
     variants: Sequence[str], given: Mapping[str, Any],
 ) -> Any:  # fmt: skip
+    if not isinstance(dataset, Dataset):
+        raise InputError(
+            f"{name}: want a Dataset, from load_dataset or Dataset.from_arrays, not {type(dataset).__name__}"
+        )
     variant = get(name, variants)
     if variant.transfer != transfer:
         raise InputError(f"{name} is a {variant.transfer} variant: call mpmbench.{variant.transfer}")
@@ -64,14 +68,37 @@ def _transfer(
     options = {"arch": arch} if arch else {}
     device = open_device(device_name, **options)
     if nodes is not None:
-        shape = dataset.grid.shape
-        if nodes.mass.shape != shape or nodes.momentum.shape != (*shape, 3):
-            raise InputError(
-                f"nodes have shapes {nodes.mass.shape} and {nodes.momentum.shape}, want {shape} and {(*shape, 3)}"
-            )
+        nodes = _checked_nodes(nodes, dataset, axes["dtype"])
     plan = planning.build_plan(variant, dataset, device, axes, nodes=nodes)
     plan.run_once(device)
     return plan.outputs()
+
+
+def _checked_nodes(nodes: Any, dataset: Dataset, dtype: str) -> Nodes:
+    """Mass and momentum as arrays of the kernels' number type; whatever is wrong is an InputError."""
+    if not isinstance(nodes, Nodes):
+        raise InputError(f"nodes: want Nodes(mass, momentum), not {type(nodes).__name__}")
+    arrays = []
+    for label, given, want in (
+        ("mass", nodes.mass, dataset.grid.shape),
+        ("momentum", nodes.momentum, (*dataset.grid.shape, 3)),
+    ):
+        array = np.asarray(given)
+        if array.shape != want:
+            raise InputError(f"nodes: {label} has shape {array.shape}, want {want}")
+        if array.dtype.kind not in "fiu":
+            raise InputError(f"nodes: {label} has dtype {array.dtype}, want real numbers")
+        with np.errstate(over="ignore"):
+            array = array.astype(dtype)
+        if not np.isfinite(array).all():
+            where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0][:3])
+            raise InputError(f"nodes: {label} of node {where} is not finite in {dtype}")
+        arrays.append(array)
+    mass, momentum = arrays
+    if mass.size and mass.min() < 0:
+        where = tuple(int(i) for i in np.unravel_index(int(np.argmin(mass)), mass.shape))
+        raise InputError(f"nodes: mass of node {where} is {mass.min():g} kg; no mass may be negative")
+    return Nodes(mass=mass, momentum=momentum)
 
 
 def list_variants(folders: Sequence[str] = ()) -> list[Variant]:

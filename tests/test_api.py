@@ -51,6 +51,41 @@ def test_refusals(particles):
         mb.g2p("g2p_global_gather", particles, type(nodes)(mass=np.ones((2, 2, 2)), momentum=np.ones((2, 2, 2, 3))))
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"mass": np.nan}, r"mass of node \(2, 3, 4\) is not finite"),
+        ({"momentum": np.inf}, r"momentum of node \(2, 3, 4\) is not finite"),
+        ({"momentum": 1e39}, "not finite in float32"),
+        ({"mass": -1}, r"mass of node \(2, 3, 4\) is -1 kg"),
+    ],
+)
+def test_bad_nodes_are_named(particles, change, message):
+    nodes = mb.p2g("p2g_global_atomic", particles)
+    arrays = {"mass": nodes.mass.astype(float), "momentum": nodes.momentum.astype(float)}
+    for label, value in change.items():
+        arrays[label][2, 3, 4] = value
+    with pytest.raises(mb.InputError, match=message):
+        mb.g2p("g2p_global_gather", particles, type(nodes)(**arrays))
+
+
+def test_things_of_another_type_are_refused(particles):
+    nodes = mb.p2g("p2g_global_atomic", particles)
+    with pytest.raises(mb.InputError, match="want a Dataset"):
+        mb.p2g("p2g_global_atomic", "uniform_cube")
+    with pytest.raises(mb.InputError, match="not tuple"):
+        mb.g2p("g2p_global_gather", particles, (nodes.mass, nodes.momentum))
+    for dtype in (str, complex):
+        with pytest.raises(mb.InputError, match="want real numbers"):
+            mb.g2p("g2p_global_gather", particles, type(nodes)(nodes.mass, nodes.momentum.astype(dtype)))
+
+
+def test_more_than_memory_holds_is_said_before_it_is_taken():
+    for particles in (10**12, 10**30):
+        with pytest.raises(mb.InputError, match="GiB of memory"):
+            mb.load_dataset("random", particles=particles)
+
+
 def test_lists_have_names_and_summaries():
     for items in (mb.list_variants(), mb.list_datasets(), mb.list_devices()):
         assert items

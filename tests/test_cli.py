@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from mpmbench import runner
 from mpmbench.cli import main
 from mpmbench.record import read_records
 
@@ -100,6 +101,16 @@ def test_impossible_combination_is_a_row_with_a_reason(tmp_path):
     invoke("run", *SMALL, "-b", "p2g_block_*", "-a", "block_shape=32x32x32", "--json", rows)
     assert {r.status for r in read_records(rows)} == {"skipped"}
     assert all("32x32x32 needs 32768 threads" in r.skipped_because for r in read_records(rows))
+
+
+def test_what_the_machine_cannot_check_is_a_row_with_a_reason(tmp_path, monkeypatch):
+    rows = tmp_path / "rows.jsonl"
+    monkeypatch.setattr(runner, "machine_bytes", lambda: 10_000_000)  # the device alone would fit
+    words = ("-d", "simulated", "--dataset", "random", "--particles", "100", "--grid-shape", "48x48x48")
+    invoke("run", *words, "-b", "p2g_global_atomic", "--json", rows)
+    (record,) = read_records(rows)
+    assert record.device_bytes_predicted < 10_000_000
+    assert "run and check need 0.03 GiB of memory" in record.skipped_because
 
 
 def test_check_debug_reports_agreement():
