@@ -10,7 +10,8 @@ lanes that took different ways meet again at the first segment both reach. Only 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Container
 from dataclasses import dataclass, field
 
 from mpmbench.errors import InputError
@@ -20,12 +21,13 @@ from mpmbench.simt.codegen_arith import ELEMENT, EMITTERS, Refused, is_float_ari
 from mpmbench.simt.codegen_ir import ELEMENT_BYTES, WARP, Writer, bits_of, element_of, integer_of
 from mpmbench.simt.codegen_memory import Site
 from mpmbench.simt.flow import Block, basic_blocks
-from mpmbench.simt.ptx import Imm, Instruction, Kernel, NotReg, Operand, Reg, Special, Symbol
+from mpmbench.simt.ptx import Address, Imm, Instruction, Kernel, NotReg, Operand, Reg, Special, Symbol
 from mpmbench.simt.scheduler import JOB
 
 MODES = ("run", "count", "debug")
 
 _NOTHING = frozenset({"membar", "fence", "nanosleep", "prefetch", "prefetchu", "call", "pmevent", "griddepcontrol"})
+_UNIFORM_ROOTS = frozenset({"mov", "cvta", "cvt", "add", "sub", "mul", "mad", "shl"})
 _BRANCHES = frozenset({"bra", "brx", "ret", "exit", "trap"})
 
 
@@ -64,6 +66,7 @@ class _Generator:
         self.entry_values: dict[str, tuple[str, list[str]]] = {}
         self.hardware_ftz, self.explicit_ftz = self._flushing()
         self.joinable = self._joinable()
+        self.uniform = self._find_uniform()
         self._lay_out()
         self.labels = 0
 
@@ -101,13 +104,30 @@ class _Generator:
                 result.update(segment.successors)
         return result
 
+    def _find_uniform(self) -> dict[Reg, Instruction]:
+        """Registers that hold the same for all lanes whenever they are read, and their only definition.
+
+        Parameters, and sums and products of them: cheaper to compute where they are read than to keep in slots, and
+        LLVM sees that all lanes agree. What whole warps read after a segment's body stays in slots.
+        """
+        instructions = self.kernel.instructions
+        writes = Counter(reg for item in instructions for reg in item.writes())
+        read_by_warps = {reg for item in instructions if _is_tail(item) for reg in item.reads()}
+        found: dict[Reg, Instruction] = {}
+        for item in instructions:
+            if item.guard is not None or len(item.dsts) != 1 or (reg := item.dsts[0]) is None:
+                continue
+            if writes[reg] == 1 and reg not in read_by_warps and _is_uniform(item, found):
+                found[reg] = item
+        return found
+
     def _lay_out(self) -> None:
         """Give every register that outlives a segment a slot in the context."""
         stored: set[Reg] = set()
         for segment in self.segments:
-            stored |= segment.live_in
+            stored |= segment.live_in - self.uniform.keys()
             last = self.kernel.instructions[segment.stop - 1]
-            if codegen_warp.is_collective(last) or codegen_warp.is_barrier(last) or last.root in _BRANCHES:
+            if _is_tail(last):
                 stored.update(last.reads())
                 stored.update(last.writes())
         at = scheduler.CONTEXT_SLOTS
@@ -231,6 +251,26 @@ class _Generator:
         return "ended"
 
 
+def _is_tail(item: Instruction) -> bool:
+    """Whether the warp as a whole carries it out, after the chunks."""
+    return item.root in _BRANCHES or codegen_warp.is_collective(item) or codegen_warp.is_barrier(item)
+
+
+def _is_uniform(item: Instruction, known: Container[Reg]) -> bool:
+    """Whether the result depends on parameters and the launch alone. known: registers of which that is so."""
+    if item.root == "ld":
+        address = item.srcs[0]
+        return "param" in item.modifiers and isinstance(address, Address) and isinstance(address.base, Symbol)
+    if item.root not in _UNIFORM_ROOTS:
+        return False
+    return all(
+        isinstance(operand, Imm)
+        or (isinstance(operand, Reg) and operand in known)
+        or (isinstance(operand, Special) and operand.name.partition(".")[0] in ("%ntid", "%nctaid", "%ctaid"))
+        for operand in item.srcs
+    )
+
+
 class SegmentBody:
     """Code for one chunk of lanes through the body of a segment: what the instruction emitters write into."""
 
@@ -291,7 +331,9 @@ class SegmentBody:
     def register(self, reg: Reg) -> str:
         if reg not in self.values:
             w = self.w
-            if reg not in self.g.slot:  # never written before: the value is undefined, take zero
+            if reg in self.g.uniform:
+                self._compute_here(reg)
+            elif reg not in self.g.slot:  # never written before: the value is undefined, take zero
                 self.values[reg] = "zeroinitializer"
             elif reg.type == "pred":
                 bits = w.load(f"i{w.lanes}", self.slot_address(reg), w.lanes // 8)
@@ -301,6 +343,13 @@ class SegmentBody:
                 align = min(64, w.lanes * ELEMENT_BYTES[element])
                 self.values[reg] = w.load(w.vector(element), self.slot_address(reg), align)
         return self.values[reg]
+
+    def _compute_here(self, reg: Reg) -> None:
+        """Repeat the definition of a uniform register, for all lanes; it has no other effect."""
+        guard, checked = self.guard, self.checked
+        self.guard = self.checked = None
+        self._emit(-1, self.g.uniform[reg])
+        self.guard, self.checked = guard, checked
 
     def slot_address(self, reg: Reg) -> str:
         """Address of the chunk's part of a register's slot."""
@@ -574,7 +623,7 @@ class SegmentBody:
 
     def store_registers(self, kept: set[Reg]) -> None:
         w = self.w
-        for reg in sorted(self.written & kept, key=lambda r: r.name):
+        for reg in sorted((self.written & kept) - self.g.uniform.keys(), key=lambda r: r.name):
             value, address = self.values[reg], self.slot_address(reg)
             if reg.type == "pred":
                 narrow = f"i{w.lanes}"
@@ -619,18 +668,13 @@ class _Segment:
         if g.mode == "count" and not codegen_warp.gathers(self.last):
             codegen_count.count_segment(g, n, f"%warp.{n}")
         body = SegmentBody(g, n, self.segment)
-        is_tail = self._is_tail()
-        stop = self.segment.stop - 1 if is_tail else self.segment.stop
+        stop = self.segment.stop - 1 if _is_tail(self.last) else self.segment.stop
         self._branch_bits: str | None = None
         if stop > self.segment.start:
             self._chunks(body, stop)
         for after in body.after_chunks:
             after(f"%warp.{n}")
         self._leave()
-
-    def _is_tail(self) -> bool:
-        last = self.last
-        return last.root in _BRANCHES or codegen_warp.is_collective(last) or codegen_warp.is_barrier(last)
 
     def _chunks(self, body: SegmentBody, stop: int) -> None:
         w, n, lanes = self.w, self.number, self.g.lanes

@@ -37,6 +37,7 @@ class Writer:
         self.lines: list[str] = []
         self.allocas: list[str] = []
         self.declarations: dict[str, str] = {}
+        self.factors: dict[str, tuple[str, str]] = {}  # of every product of floats
         self._count = 0
 
     # --- lines and names ---
@@ -93,7 +94,10 @@ class Writer:
     # --- operations ---
 
     def binary(self, operation: str, element: str, left: str, right: str) -> str:
-        return self.value(f"{operation} {self.vector(element)} {left}, {right}")
+        name = self.value(f"{operation} {self.vector(element)} {left}, {right}")
+        if operation == "fmul":
+            self.factors[name] = left, right
+        return name
 
     def compare(self, operation: str, element: str, left: str, right: str) -> str:
         """operation: ``icmp slt``, ``fcmp olt``, ..."""

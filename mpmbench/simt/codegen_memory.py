@@ -30,6 +30,9 @@ _HINTS = re.compile(
 _SPACES = frozenset({"global", "shared", "local", "const", "param"})
 
 
+_SHARED_QUADS = 4  # runs that must share a quad before it is worth staging it apart
+
+
 @dataclass(frozen=True)
 class Access:
     """What a memory instruction does, from its modifiers. space is ``generic`` where none is named."""
@@ -676,7 +679,8 @@ def _runs(entries: list[Deferred]) -> list[list[Deferred]]:
 
 def _add_runs(ctx: SegmentBody, mask: str, runs: list[list[Deferred]]) -> None:
     w, n = ctx.w, ctx.w.lanes
-    staged = [(run, _stage(ctx, run)) for run in runs]
+    products = _products(ctx, runs)
+    staged = [(run, None if at in products else _stage(ctx, run)) for at, run in enumerate(runs)]
 
     def body(lane: str) -> None:
         # Element of the lane in transposed quads: row lane % 4, tile lane / 4.
@@ -687,7 +691,8 @@ def _add_runs(ctx: SegmentBody, mask: str, runs: list[list[Deferred]]) -> None:
         quad_at = w.value(f"add i64 {row_at}, {tile_at}")
         pair_at = w.value(f"shl i64 {lane}, 1")
         offsets: dict[str, str] = {}
-        for run, values in staged:
+        quads: dict[str, str] = {}
+        for number, (run, values) in enumerate(staged):
             first = run[0]
             element = ELEMENT[first.access.kind]
             length = len(run)
@@ -702,9 +707,16 @@ def _add_runs(ctx: SegmentBody, mask: str, runs: list[list[Deferred]]) -> None:
                 pointer = w.value(f"inttoptr i64 {place} to ptr")
             else:
                 pointer = w.value(f"getelementptr i8, ptr {first.base}, i64 {place}")
-            at = {1: lane, 2: pair_at, 4: quad_at}[length]
             size = ELEMENT_BYTES[element]
-            value = w.load(kind, w.value(f"getelementptr {element}, ptr {values}, i64 {at}"), size * length)
+            if values is None:
+                quad, factor = products[number]
+                if quad not in quads:
+                    quad_pointer = w.value(f"getelementptr {element}, ptr {quad}, i64 {quad_at}")
+                    quads[quad] = w.load(kind, quad_pointer, size * length)
+                value = _scaled(ctx, kind, element, quads[quad], factor, lane)
+            else:
+                at = {1: lane, 2: pair_at, 4: quad_at}[length]
+                value = w.load(kind, w.value(f"getelementptr {element}, ptr {values}, i64 {at}"), size * length)
             old = w.load(kind, pointer, size)
             if is_float(first.access.kind):
                 new = _float_sum(ctx, first.access, kind, length, old, value)
@@ -715,18 +727,70 @@ def _add_runs(ctx: SegmentBody, mask: str, runs: list[list[Deferred]]) -> None:
     _for_each_lane(ctx, mask, body)
 
 
+def _products(ctx: SegmentBody, runs: list[list[Deferred]]) -> dict[int, tuple[str, str]]:
+    """Runs of four whose values are one quad times a factor of their own: run -> (staged quad, staged factor).
+
+    A transfer adds w (vx, vy, vz, 1) to many nodes, with another w for each: it is cheaper to put the quad into memory
+    once and to multiply lane by lane, which rounds alike, than to transpose four products for every node.
+    """
+    w = ctx.w
+    groups: dict[tuple[str, tuple[str | None, ...]], list[tuple[int, str]]] = {}
+    for at, run in enumerate(runs):
+        if len(run) == 4 and is_float(run[0].access.kind):
+            values = [entry.value for entry in run]
+            for factor in _common_factors(ctx, values):
+                quad = tuple(_cofactor(ctx, value, factor) for value in values)
+                groups.setdefault((run[0].access.kind, quad), []).append((at, factor))
+    found: dict[int, tuple[str, str]] = {}
+    for (kind, quad), members in groups.items():
+        fresh = [(at, factor) for at, factor in members if at not in found]
+        if len(fresh) < _SHARED_QUADS:
+            continue
+        element = ELEMENT[kind]
+        one = w.splat_bits(element, 0x3F800000 if element == "float" else 0x3FF0000000000000)
+        staged = _stage_values(ctx, element, [one if part is None else part for part in quad])
+        for at, factor in fresh:
+            found[at] = staged, _stage_values(ctx, element, [factor])
+    return found
+
+
+def _common_factors(ctx: SegmentBody, values: Sequence[str]) -> list[str]:
+    """What divides all values: each is it, or a product with it."""
+    parts = [dict.fromkeys((value, *ctx.w.factors.get(value, ()))) for value in values]
+    return [part for part in parts[0] if all(part in others for others in parts[1:])]
+
+
+def _cofactor(ctx: SegmentBody, value: str, factor: str) -> str | None:
+    """The other factor, or None for one."""
+    if value == factor:
+        return None
+    left, right = ctx.w.factors[value]
+    return right if left == factor else left
+
+
+def _scaled(ctx: SegmentBody, kind: str, element: str, quad: str, factor: str, lane: str) -> str:
+    """A lane's quad times its factor."""
+    w = ctx.w
+    scalar = w.load(element, w.value(f"getelementptr {element}, ptr {factor}, i64 {lane}"), ELEMENT_BYTES[element])
+    first = w.value(f"insertelement {kind} poison, {element} {scalar}, i32 0")
+    splat = w.value(f"shufflevector {kind} {first}, {kind} poison, <4 x i32> zeroinitializer")
+    return w.value(f"fmul {kind} {quad}, {splat}")
+
+
 def _stage(ctx: SegmentBody, run: list[Deferred]) -> str:
     """Put the values of a run into memory so that those of one lane stand together."""
+    return _stage_values(ctx, ELEMENT[run[0].access.kind], [entry.value for entry in run])
+
+
+def _stage_values(ctx: SegmentBody, element: str, values: Sequence[str]) -> str:
     w, n = ctx.w, ctx.w.lanes
-    element = ELEMENT[run[0].access.kind]
     size = ELEMENT_BYTES[element]
-    buffer = w.buffer(n * size * len(run))
-    values = [entry.value for entry in run]
+    buffer = w.buffer(n * size * len(values))
     align = min(64, n * size)
-    if len(run) == 4:
+    if len(values) == 4:
         for row, column in enumerate(w.transpose4(element, values)):
             w.store(w.vector(element), column, w.at(buffer, row * n * size), align)
-    elif len(run) == 2:
+    elif len(values) == 2:
         for half in range(2):
             lanes = range(half * n // 2, (half + 1) * n // 2)
             pairs = w.shuffle(element, values[0], values[1], [i for lane in lanes for i in (lane, lane + n)])
