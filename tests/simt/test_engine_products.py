@@ -31,7 +31,11 @@ def text(nodes: int, order: str = "b * f", last: str = "f", real: str = "float")
 
 
 def is_factored(cuda: str, element: str = "float") -> bool:
-    parsed = ptx.parse(nvrtc.compile_cuda(cuda, "sm_70", OPTIONS))
+    return is_factored_ptx(nvrtc.compile_cuda(cuda, "sm_70", OPTIONS), element)
+
+
+def is_factored_ptx(text: str, element: str = "float") -> bool:
+    parsed = ptx.parse(text)
     return f"fmul <4 x {element}>" in generate(parsed.kernels["kernel"], {}, "run", 16).text
 
 
@@ -59,6 +63,7 @@ def test_either_side_of_a_product_may_be_the_factor():
     compiled = nvrtc.compile_cuda(text(4), "sm_70", OPTIONS)
     swapped = re.sub(r"(mul\.ftz\.f32\s+%f\d+), (%f\d+), (%f\d+);", r"\1, \3, \2;", compiled)
     assert swapped != compiled
+    assert is_factored_ptx(swapped)
     x, w = np.random.default_rng(6).normal(size=(2, 64, 4)).astype(np.float32)
     results = []
     for source in (compiled, swapped):
