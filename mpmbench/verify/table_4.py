@@ -170,8 +170,8 @@ def _table_of_sums(sums: Sequence[Sums], payload: str, weights: str, trips: int,
              "what the float32 sums show on top is the reduction's."]  # fmt: skip
     notes += [f"Printed {row['row']}: {row['erratum']}." for row in published_rows(4) if row["erratum"]]
     notes.append(
-        "Momentum is handed on from trip to trip: plain float32 weights, which sum to 1 + 0.35 eps on average on each "
-        "of three axes, make it grow by 1.25e-07 of itself in every trip, 1.25e-04 in a thousand. Mass is not handed on."
+        "Momentum is handed on from trip to trip, mass is not: plain float32 weights, which sum to 1 + 0.35 eps on "
+        "average on each of three axes, let momentum grow by about 1.2e-07 of itself per trip, 1.2e-04 in a thousand."
     )
     return make_table(f"{payload}, weights={weights}, after {trips:,} round trips", columns, rows, notes)
 
