@@ -49,7 +49,10 @@ class _Group(click.Group):
             notes.print("mpmbench: out of memory: take fewer particles (--particles) or a smaller grid", soft_wrap=True)
             ctx.exit(1)
         except KeyboardInterrupt:
-            notes.print("mpmbench: interrupted; finished rows are on disk, --resume goes on from there", soft_wrap=True)
+            notes.print(
+                "mpmbench: interrupted; what is in --json FILE is whole, run --resume goes on from there",
+                soft_wrap=True,
+            )
             ctx.exit(INTERRUPTED)
 
 

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -220,6 +221,16 @@ def test_full_disk(tmp_path, monkeypatch):
     out = invoke("run", *SMALL, "-b", "p2g_global_*", "--json", rows, "--resume", code=2)
     assert "no space left on device" in out.strip().splitlines()[-1]
     assert rows.read_bytes() == before
+
+
+@pytest.mark.parametrize("command", ["run", "check"])
+def test_a_wrong_result_is_exit_code_4(tmp_path, command):
+    shipped = Path(runner.__file__).parent
+    for folder, suffix in (("variants", ".py"), ("raw_kernels", ".cu")):
+        text = (shipped / folder / f"p2g_global_atomic{suffix}").read_text().replace("p2g_global_atomic", "p2g_wrong")
+        (tmp_path / f"p2g_wrong{suffix}").write_text(text.replace("source.mass", "(source.mass * real(1.001))"))
+    out = invoke(command, *SMALL, "--variants", tmp_path, "-b", "p2g_wrong", "--json", tmp_path / "r.jsonl", code=4)
+    assert "1 rows: 1 wrong" in out
 
 
 # --- interruption -----------------------------------------------------------------------------------------------------

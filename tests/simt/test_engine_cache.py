@@ -48,6 +48,15 @@ def test_damaged_entries_are_compiled_again(folder):
     assert works()
 
 
+def test_an_entry_with_one_wrong_byte_is_none(folder):
+    cache.store("ptx", "ab" * 32, b"some text")
+    assert cache.load("ptx", "ab" * 32) == b"some text"
+    (path,) = (path for path in folder.rglob("*") if path.is_file())
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-3] + bytes([whole[-3] ^ 1]) + whole[-2:])
+    assert cache.load("ptx", "ab" * 32) is None
+
+
 def test_a_folder_that_cannot_be_written_is_no_failure(tmp_path, monkeypatch):
     blocked = tmp_path / "file"
     blocked.write_text("not a folder")
