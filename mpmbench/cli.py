@@ -132,7 +132,11 @@ def _choose(
     chosen = _match([*shipped, *primitives.discover(variant_dirs)], patterns) if patterns else shipped
     transfers = [strategy for strategy in chosen if isinstance(strategy, variants.Variant)]
     blocks = [strategy for strategy in chosen if isinstance(strategy, primitives.Primitive)]
-    given = dict(map(_parse_axis, axes))
+    given: dict[str, list[Any]] = {}
+    for name, values in map(_parse_axis, axes):
+        if name in given:
+            raise InputError(f"axis {name!r} is given twice: write {name}=[value,value]")
+        given[name] = values
     known = {name for strategy in chosen for name in strategy.axes}
     if unknown := [name for name in given if name not in known]:
         raise InputError(f"unknown axis {unknown[0]!r}: valid are {', '.join(sorted(known))}")
@@ -330,6 +334,8 @@ def check(
     records = _run_cases(cases, opened, json_path, "replace", quick)
     for record in records:
         error = f"error/allowed {record.check.ratio:.3f}" if record.check else ""
+        if record.check and record.check.worst_node:
+            error += f" at {'x'.join(map(str, record.check.worst_node))}"
         reason = record.skipped_because or record.failed_because or ""
         console.print(f"{record.status:9}{record.device:10} {record.variant} {record.dataset.name} {error}{reason}",
                       markup=False, soft_wrap=True)  # fmt: skip

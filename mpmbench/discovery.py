@@ -146,7 +146,7 @@ def _load_file(path: Path) -> ModuleType:
     write, sys.dont_write_bytecode = sys.dont_write_bytecode, True
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise InputError(f"cannot load variant module {path}: {type(error).__name__}: {error}") from error
     finally:
         sys.dont_write_bytecode = write

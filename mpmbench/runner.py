@@ -208,11 +208,13 @@ def _run(
     plan = planning.build_plan(variant, dataset, device, axes, nodes=nodes)
     preprocess, transfer, finish = plan.run_once(device)
     check = check_outputs(plan.outputs(), variant.transfer, inputs, axes)
-    about |= kernel_facts(device, plan.transfer.launches, transfer.counters)
+    # A wrong row keeps no figures: its counts are those of another computation.
+    counters = transfer.counters if check.passed else None
+    about |= kernel_facts(device, plan.transfer.launches, counters)
     findings = [f for report in (*preprocess.values(), transfer, *finish.values()) for f in report.findings]
     about |= {"check": Check.of(check), "findings": tuple(findings)}
     if device.name == "simulated":
-        if transfer.counters is not None:
+        if counters is not None:
             about["preprocess"] = {name: StepCost(counters=report.counters) for name, report in preprocess.items()}
             about["finish"] = {name: StepCost(counters=report.counters) for name, report in finish.items()}
     elif check.passed:

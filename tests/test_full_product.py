@@ -1,22 +1,24 @@
 """Every combination of every axis of every strategy, against the reference: hours of work for ``make test-all``.
 
-What has passed is noted in the cache folder under the hash of its kernel, so a run that was stopped goes on where it
-was, and a changed kernel is run again.
+What has passed is noted in the cache folder under a hash of the whole package, so a run that was stopped goes on where
+it was, and any change of the code starts afresh.
 """
 
 from __future__ import annotations
 
 import itertools
 import random
+from pathlib import Path
 
 import pytest
 from transfers import crowded, transfer
 
+import mpmbench
 from mpmbench.device import open_device
-from mpmbench.kernel import load_source
 from mpmbench.simt import cache
 from mpmbench.variants import discover, why_impossible
-from mpmbench.workspace import kernel_constants
+
+PACKAGE = Path(mpmbench.__file__).parent
 
 
 @pytest.mark.slow
@@ -29,12 +31,12 @@ def test_every_combination(variant) -> None:
     rows = [axes for axes in rows if why_impossible(variant, axes) is None]
     random.Random(1).shuffle(rows)  # a run that is stopped early has seen a bit of everything
     device = open_device("simulated", arch="sm_52", mode="run")
+    code = "".join(path.read_text() for path in sorted(PACKAGE.rglob("*")) if path.suffix in {".py", ".cu", ".cuh"})
     dataset = crowded()
     with pytest.MonkeyPatch.context() as patch, journal.open("a") as notes:
         patch.setattr(cache, "store", lambda *_: None)  # tens of thousands of kernels would fill the disk
         for axes in rows:
-            source = load_source(variant.kernel_path, kernel_constants(axes))
-            key = cache.content_key(source.text, repr(sorted(axes.items())))
+            key = cache.content_key(code, repr(sorted(axes.items())))
             if key in passed:
                 continue
             check, _, findings = transfer(variant, dataset, device, **axes)

@@ -105,6 +105,8 @@ def test_own_variant_is_checked_by_the_same_reference(folder) -> None:
     run("run", "--variants", folder, "-b", "p2g_backwards", *SMALL, "--json", rows)
     (record,) = read_records(rows)
     assert record.status == "wrong"
+    assert record.transfer_counters is None
+    assert not record.preprocess
 
 
 def test_broken_kernel_is_one_row_with_the_compilers_words(folder) -> None:

@@ -201,7 +201,7 @@ def _answer(groups: Sequence[Group], measured: bool) -> list[str]:
     timed = [g for g in groups if not g.simulated and g.ranked]
     if not measured:
         sentences.append(
-            "No GPU took part: every number below is counted on a simulated device, exactly, and is not time. "
+            "No GPU took part: every cost below is counted on a simulated device, exactly, and is not time. "
             "Run the same command where there is a GPU for times and speedups."
         )
     for g in timed[:NAMED]:
@@ -246,7 +246,8 @@ def _attention(records: Sequence[Record], groups: Sequence[Group]) -> list[Atten
     for r in records:
         where = f"{tables.label(r)} on {tables.dataset_name(r.dataset)}"
         if r.status == "wrong":
-            action = f"Do not use it; `mpmbench check -b {r.variant}` shows where it first differs."
+            again = f"`mpmbench check -b {r.variant}` on the same data (with `--debug` for races)"
+            action = f"Do not use it; {again} says where it differs most."
             note("wrong", f"Wrong result of {r.variant}", action, f"{where}, {tables.error_text(r)}")
         elif r.status == "findings":
             action = "Its result cannot be relied on; the findings below name the lines."
