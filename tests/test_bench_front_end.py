@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -38,7 +39,9 @@ def test_event_times_reach_the_benchmark_file(tmp_path, name) -> None:
     (tmp_path / "conftest.py").write_text(CONFTEST)
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--benchmark-json=out.json",
                "-k", f"test_cuda and {name} and uniform_cube", "test_transfers.py"]  # fmt: skip
-    process = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    # pytest-benchmark stands aside inside a worker of pytest-xdist, which this child would take itself for.
+    env = {key: value for key, value in os.environ.items() if not key.startswith("PYTEST_XDIST")}
+    process = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=120)
     assert process.returncode == 0, process.stdout + process.stderr
     (benchmark,) = json.loads((tmp_path / "out.json").read_text())["benchmarks"]
     assert benchmark["group"] == "cuda: event time"

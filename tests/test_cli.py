@@ -242,7 +242,14 @@ def test_interrupted_run_keeps_finished_rows(tmp_path, how):
     words = ["run", *SMALL, "-b", "p2g_global_atomic", "-a", "spline=[linear,quadratic,cubic]", "-a",
              "layout=[soa,aos]", "-a", "weights=[unity,plain]"]  # fmt: skip
     command = [sys.executable, "-m", "mpmbench", *words, "--json", str(rows)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    # Where the tests themselves run in the background, their children would be born deaf to Ctrl-C.
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     deadline = time.monotonic() + 120
     while not (rows.exists() and rows.read_bytes().count(b"\n") >= 2):
         assert process.poll() is None, process.communicate()
