@@ -7,6 +7,7 @@ import errno
 import math
 import os
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -261,6 +262,16 @@ def test_no_baseline_no_break_even_and_it_says_so():
 
 
 # ---- measured ----------------------------------------------------------------------------------------------------
+
+
+def test_published_primitives_are_counted_per_element():
+    scan = replace(
+        simulated(preset_row={"source": "thesis", "table": 8, "row": "unrolled", "place": 0}), transfer="scan"
+    )
+    (table,) = tables.presets([scan])
+    titles = [column.title for column in table.columns]
+    assert "sectors / element" in titles
+    assert not [title for title in titles if "particle" in title]
 
 
 def test_no_winner_below_the_resolution_of_events():

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
 from typing import Any
@@ -989,6 +989,13 @@ def _other_printed(name: str) -> Callable[[Record], Any]:
     return lambda record: (_preset(record, "published") or {}).get(name)
 
 
+def _per_unit(source: _Source, records: Sequence[Record]) -> _Source:
+    """The same column, named by what the rows process: transfers particles, primitives elements."""
+    if all(r.transfer in ("p2g", "g2p") for r in records):
+        return source
+    return replace(source, column=replace(source.column, title=source.column.title.replace("particle", "element")))
+
+
 def _published(records: list[Record]) -> Table:
     """Rows in printed order. A row printed without a speedup is the baseline of those after it."""
     speedups_printed = any(_preset(r, "published_speedup") is not None for r in records)
@@ -1024,7 +1031,7 @@ def _published(records: list[Record]) -> Table:
         row, where, _STRATEGY, _AXES, _REMARK,
         published("time [µs]", lambda r: _preset(r, "published_us")),
         published("speedup", lambda r: _preset(r, "published_speedup")),
-        _AGREEMENT, _SECTORS, _WARP_INST,
+        _AGREEMENT, *(_per_unit(source, records) for source in (_SECTORS, _WARP_INST)),
         ours("sectors, baseline / this", Kind.SIMULATED, against(count_of(sectors)), Quantity.FACTOR,
              "sectors of the printed table's baseline over this row's; not a speedup"),
         ours("warp inst, baseline / this", Kind.SIMULATED, against(count_of(warp_inst)), Quantity.FACTOR,
