@@ -76,7 +76,8 @@ class Shelf:
         A folder may hold strategies of several kinds: modules with another kind's constant are passed over.
         """
         found = {strategy.name: strategy for strategy in self._shipped()}
-        for folder in map(Path, extra_dirs):
+        folders = [extra_dirs] if isinstance(extra_dirs, str | Path) else extra_dirs  # one folder may come alone
+        for folder in map(Path, folders):
             for path, module in _modules_of(folder):
                 if not hasattr(module, self.constant) and any(hasattr(module, other) for other in CONSTANTS):
                     continue

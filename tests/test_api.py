@@ -86,6 +86,13 @@ def test_more_than_memory_holds_is_said_before_it_is_taken():
             mb.load_dataset("random", particles=particles)
 
 
+def test_no_device_and_one_folder_alone(particles, tmp_path):
+    with pytest.raises(mb.InputError, match="unknown device None"):
+        mb.p2g("p2g_global_atomic", particles, device=None)
+    with pytest.raises(mb.InputError, match=str(tmp_path / "nowhere")):
+        mb.p2g("p2g_global_atomic", particles, variants=str(tmp_path / "nowhere"))
+
+
 def test_lists_have_names_and_summaries():
     for items in (mb.list_variants(), mb.list_datasets(), mb.list_devices()):
         assert items

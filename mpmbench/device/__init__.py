@@ -109,7 +109,7 @@ def open_device(name: str, **options: Any) -> Device:
         from mpmbench.device.simulated import SimulatedDevice
 
         return SimulatedDevice(**options)
-    if name == "cuda" or name.startswith("cuda:"):
+    if isinstance(name, str) and (name == "cuda" or name.startswith("cuda:")):
         from mpmbench.device.cuda import CudaDevice
 
         return CudaDevice(name, **options)
