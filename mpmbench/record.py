@@ -508,7 +508,8 @@ def load_records(paths: str | Path | Sequence[str | Path]) -> pd.DataFrame:
     """Records of one or more JSON-lines files as a pandas DataFrame: one row per record, flat columns.
 
     Columns are prefixed by what they hold: ``axis_``, ``check_``, ``transfer_``, ``preprocess_`` (all its
-    steps together), ``step_<name>_``, ``modelled_<gpu>_``, ``environment_``. Counters end in the counter's name, times in ``_s``.
+    steps together), ``step_<name>_``, ``modelled_<gpu>_``, ``environment_``. Counters end in
+    the counter's name, times in ``_s``.
     """
     import pandas as pd
 
@@ -540,8 +541,8 @@ def flatten(record: Record) -> dict[str, Any]:
         row |= _flat_cost(f"step_{name}", step)
     for gpu, profile in (record.modelled or {}).items():
         time = profile.time
-        row |= {f"modelled_{gpu}_s": time.seconds, f"modelled_{gpu}_low_s": time.low, f"modelled_{gpu}_high_s": time.high}
-        row |= {f"modelled_{gpu}_bound": time.bound, f"modelled_{gpu}_calibrated": time.calibrated}
+        shown = {"s": time.seconds, "low_s": time.low, "high_s": time.high, "bound": time.bound}
+        row |= {f"modelled_{gpu}_{name}": value for name, value in shown.items()}
     row |= {
         "device_bytes_predicted": record.device_bytes_predicted,
         "findings": len(record.findings),

@@ -11,10 +11,12 @@ from dataclasses import asdict, dataclass, field, replace
 from mpmbench.errors import InputError
 from mpmbench.measure import SHORTEST_RANKED, too_fast_to_rank
 from mpmbench.record import Record
-from mpmbench.report import banks, primitives
+from mpmbench.report import banks, modelled, primitives, profile
 from mpmbench.report import table as tables
 from mpmbench.report.banks import BankPicture
+from mpmbench.report.modelled import GpuGroup
 from mpmbench.report.plots import Bars, Line, Lines, logspace, thin
+from mpmbench.report.profile import Card
 from mpmbench.report.table import Group, Kind, Table
 from mpmbench.report.text import number, seconds_text
 
@@ -26,7 +28,7 @@ KINDS = {
     Kind.PREDICTED: "follows from sizes or from the compiler, known before anything runs",
     Kind.SIMULATED: "counted exactly while the CUDA kernel ran on the simulated device; not time",
     Kind.MEASURED: "event time on a GPU",
-    Kind.MODELLED: "performance model of a named GPU",
+    Kind.MODELLED: "performance model of a named GPU, its caches and DRAM included; never measured",
     Kind.PUBLISHED: "printed in the source named, on its GPU",
 }
 
@@ -55,6 +57,7 @@ class Section:
     charts: tuple[Bars | Lines | BankPicture, ...] = ()
     details: tuple[Details, ...] = ()
     intro: str = ""
+    cards: tuple[Card, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,8 @@ class Extent:
     """How much a document holds.
 
     charts: how many groups get them; drawing takes time.  rows: of a table, the best ones.  groups: how many get a
-    section, in the order run; the summary still has all.
+    section, in the order run; the summary still has all.  cards: how many strategies get a profile of their own, of
+    all GPUs together; the tables still have all.
     """
 
     hottest: bool = True
@@ -83,17 +87,18 @@ class Extent:
     charts: int = 24
     rows: int | None = None
     groups: int | None = None
+    cards: int = 60
 
 
 # From everything to what always fits.
 EXTENTS = (
     Extent(),
     Extent(hottest=False),
-    Extent(hottest=False, steps=False),
-    Extent(hottest=False, steps=False, charts=0),
-    Extent(hottest=False, steps=False, charts=0, rows=200, groups=100),
-    Extent(hottest=False, steps=False, charts=0, rows=40, groups=40),
-    Extent(hottest=False, steps=False, charts=0, rows=10, groups=10),
+    Extent(hottest=False, steps=False, cards=30),
+    Extent(hottest=False, steps=False, charts=0, cards=12),
+    Extent(hottest=False, steps=False, charts=0, rows=200, groups=100, cards=0),
+    Extent(hottest=False, steps=False, charts=0, rows=40, groups=40, cards=0),
+    Extent(hottest=False, steps=False, charts=0, rows=10, groups=10, cards=0),
 )
 
 
@@ -104,7 +109,10 @@ def build(records: Sequence[Record], extent: Extent = EXTENTS[0]) -> Document:
     records = list(records)
     transfers = [record for record in records if record.is_transfer]
     groups = tables.group(transfers)
-    sections = [Section("Answer in one table", tuple(tables.summary(groups)))] if any(g.ranked for g in groups) else []
+    on_gpus = modelled.gpu_groups(records)
+    sections = _modelled_sections(on_gpus, extent)
+    if any(g.ranked for g in groups):
+        sections.append(Section("Answer in one table", tuple(tables.summary(groups))))
     if published := tables.presets(records):
         sections.append(Section("Published tables, and the same rows here", tuple(published)))
     several_devices = len({g.device for g in groups}) > 1
@@ -135,12 +143,15 @@ def build(records: Sequence[Record], extent: Extent = EXTENTS[0]) -> Document:
         left_out.append(f"charts of {_plural(len(groups) - extent.charts, 'section')}")
     if extent.groups is not None and len(groups) > extent.groups:
         left_out.append(_plural(len(groups) - extent.groups, "section"))
+    profiled = sum(len(g.runs) for g in on_gpus)
+    if extent.cards < profiled:
+        left_out.append(f"charts and lines of {_plural(profiled - extent.cards, 'profile')}")
     verdict, agreed = _verdict(records)
     return Document(
         title="mpmbench report",
         verdict=verdict,
         agreed=agreed,
-        answer=tuple(_answer(groups, any(record.transfer_measurement for record in records))),
+        answer=tuple(_answer(groups, on_gpus, any(record.transfer_measurement for record in records))),
         attention=tuple(_attention(records, groups)),
         sections=tuple(sections),
         legend=_legend(sections),
@@ -196,10 +207,16 @@ def _plural(count: int, one: str, many: str = "") -> str:
     return f"{count:,} {one if count == 1 else many or one + 's'}"
 
 
-def _answer(groups: Sequence[Group], measured: bool) -> list[str]:
+def _answer(groups: Sequence[Group], on_gpus: Sequence[GpuGroup], measured: bool) -> list[str]:
     sentences = []
     timed = [g for g in groups if not g.simulated and g.ranked]
-    if not measured:
+    transfers = [g for g in on_gpus if g.group.first.is_transfer]
+    if not measured and on_gpus:
+        sentences.append(
+            "No GPU took part: costs are counted on a simulated device, and every time below is modelled for the GPU "
+            "that it names, with a range."
+        )
+    elif not measured:
         sentences.append(
             "No GPU took part: every cost below is counted on a simulated device, exactly, and is not time. "
             "Run the same command where there is a GPU for times and speedups."
@@ -217,6 +234,9 @@ def _answer(groups: Sequence[Group], measured: bool) -> list[str]:
         sentences.append(f"{words}.")
     if len(timed) > NAMED:
         sentences.append(f"The table below has {_plural(len(timed) - NAMED, 'more measured case')}.")
+    sentences += [modelled.answer(g) for g in transfers[:NAMED]]
+    if len(transfers) > NAMED:
+        sentences.append(f"The table below has {_plural(len(transfers) - NAMED, 'more modelled case')}.")
     for transfer in ("p2g", "g2p"):
         counted = [g for g in groups if g.simulated and g.ranked and g.first.transfer == transfer]
         for name, counter in (("sectors", tables.sectors), ("warp instructions", tables.warp_inst)):
@@ -290,6 +310,38 @@ def _where(places: list[str]) -> str:
         return "."
     more = f"; and {len(named) - NAMED} more" if len(named) > NAMED else ""
     return f": {'; '.join(named[:NAMED])}{more}."
+
+
+# ---- modelled ----------------------------------------------------------------------------------------------
+
+RANKINGS_IN_SIGHT = 2  # more of them are folded away
+
+
+def _modelled_sections(on_gpus: Sequence[GpuGroup], extent: Extent) -> list[Section]:
+    """Who wins on which GPU, then what binds each strategy there."""
+    sections = []
+    transfers = [g for g in on_gpus if g.group.first.is_transfer]
+    if transfers:
+        rankings = [modelled.ranking(g) for g in transfers[: extent.groups]]
+        shown, details = tuple(rankings), ()
+        if len(rankings) > RANKINGS_IN_SIGHT:
+            shown, details = (), tuple(Details(t.title, (_untitled(t),)) for t in rankings)  # type: ignore[assignment]
+        intro = (
+            "Times are modelled, not measured, each with the range that the model claims; where ranges overlap, the "
+            "order is within its error. A transfer alone, and with the sort that it needs."
+        )
+        winners = modelled.winners_table(transfers)
+        sections.append(Section("What would it do on my GPU?", (winners, *shown), (), details, intro))
+    left = extent.cards
+    for g in on_gpus[: extent.groups]:
+        drawn = g.runs[:left]
+        left -= len(drawn)
+        shown = tuple(filter(None, (profile.overview(g), profile.metrics(g), profile.traffic(g))))
+        cards = tuple(profile.card(g, r) for r in drawn)
+        cards += tuple(profile.card(g, r, charts=False, lines=False) for r in g.runs[len(drawn) :])
+        intro = profile.EXPLANATION.format(gpu=g.gpu_title)
+        sections.append(Section(f"Profile: {g.title}", shown, intro=intro, cards=cards))
+    return sections
 
 
 # ---- groups ------------------------------------------------------------------------------------------------
@@ -377,7 +429,9 @@ def _break_even_lines(g: Group) -> list[Bars | Lines]:
 
 
 def _legend(sections: Sequence[Section]) -> tuple[tuple[str, str, str], ...]:
-    shown = [t for s in sections for t in (*s.tables, *(t for d in s.details for t in d.tables))]
+    shown = [t for s in sections for t in s.tables]
+    shown += [t for s in sections for d in s.details for t in d.tables]
+    shown += [t for s in sections for c in s.cards for t in c.tables]
     columns = {
         (c.title, "" if c.kind is Kind.NAME else str(c.kind), c.explain): None
         for t in shown

@@ -17,6 +17,7 @@ from mpmbench.report.text import number
 
 if TYPE_CHECKING:
     from mpmbench.report.banks import BankPicture
+    from mpmbench.report.speed_of_light import Roofline, SpeedOfLight
 
 INK = "#010101"
 RULE = "#020202"
@@ -60,7 +61,7 @@ class Lines:
 
 
 @lru_cache(maxsize=256)
-def svg(chart: Bars | Lines | BankPicture) -> str:
+def svg(chart: Bars | Lines | BankPicture | SpeedOfLight | Roofline) -> str:
     """An ``<svg>`` element. Kept, as a page that comes out too large is laid out again with less on it."""
     import matplotlib
 
@@ -84,9 +85,11 @@ def svg(chart: Bars | Lines | BankPicture) -> str:
             return _bars(chart)
         if isinstance(chart, Lines):
             return _lines(chart)
-        from mpmbench.report.banks import draw
+        from mpmbench.report import banks, speed_of_light
 
-        return draw(chart)
+        if isinstance(chart, banks.BankPicture):
+            return banks.draw(chart)
+        return speed_of_light.draw(chart)
 
 
 def _bars(chart: Bars) -> str:

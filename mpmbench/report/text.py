@@ -30,9 +30,9 @@ def format_value(value: Any, quantity: Quantity) -> str:
         case Quantity.SECONDS:
             return seconds_text(value)
         case Quantity.SECONDS_RANGE:
-            return range_text(*value, seconds_text)
+            return range_text(value[0], value[1], seconds_text)
         case Quantity.TRANSFERS_RANGE:
-            return range_text(*value, transfers_text)
+            return range_text(value[0], value[1], transfers_text)
         case Quantity.RATE:
             return scaled(value, 1000, ("", " k", " M", " G", " T"))
         case Quantity.FACTOR:
