@@ -245,11 +245,11 @@ def sentence(record: Record, profile: Profile) -> str:
     if time.seconds and launch / time.seconds > LAUNCH_BOUND:
         return f"Launch overhead is {_share(launch, profile)} of the time: more work per launch would help."
     first, *others = binding(profile)
-    words = f"Bound by {TERM_WORDS[first]} ({_share(time.terms.get(first, 0.0), profile)} of the time)"
+    words = f"Bound by {TERM_WORDS[first]}, {_share(time.terms.get(first, 0.0), profile)} of the time"
     if not others:
         return f"{words}: {advice(first, facts)}."
     second = others[0]
-    words += f" or, within the model's range, by {TERM_WORDS[second]} ({_share(time.terms[second], profile)})"
+    words += f" or, within the model's range, by {TERM_WORDS[second]}, {_share(time.terms[second], profile)}"
     for_first, for_second = advice(first, facts), advice(second, facts)
     if for_first == for_second:
         return f"{words}: {for_first}."

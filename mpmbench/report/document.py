@@ -87,15 +87,15 @@ class Extent:
     charts: int = 24
     rows: int | None = None
     groups: int | None = None
-    cards: int = 60
+    cards: int = 24
 
 
 # From everything to what always fits.
 EXTENTS = (
     Extent(),
     Extent(hottest=False),
-    Extent(hottest=False, steps=False, cards=30),
-    Extent(hottest=False, steps=False, charts=0, cards=12),
+    Extent(hottest=False, steps=False, cards=12),
+    Extent(hottest=False, steps=False, charts=0, cards=6),
     Extent(hottest=False, steps=False, charts=0, rows=200, groups=100, cards=0),
     Extent(hottest=False, steps=False, charts=0, rows=40, groups=40, cards=0),
     Extent(hottest=False, steps=False, charts=0, rows=10, groups=10, cards=0),

@@ -76,7 +76,7 @@ def _rows(table: Table) -> list[dict[str, Any]]:
         for c, (cell, column) in enumerate(zip(row.cells, table.columns, strict=True)):
             text = format_value(cell.value, column.quantity)
             if column.under:
-                cells[-1]["under"] = text
+                cells[-1]["under"] = "" if cell.value is None else text
                 continue
             cells.append(
                 {

@@ -183,7 +183,7 @@ def _modelled(
 def winners_table(groups: Sequence[GpuGroup]) -> Table:
     """The fastest strategy per GPU, dataset and problem; whoever cannot be told from it stands beneath it."""
     columns = (
-        Column("GPU", Kind.NAME, Quantity.TEXT),
+        Column("GPU", Kind.NAME, Quantity.CODE),
         Column("transfer", Kind.NAME, Quantity.TEXT),
         Column("dataset", Kind.NAME, Quantity.CODE),
         _modelled("fastest transfer", Quantity.CODE, explain="least modelled time, the transfer alone"),
@@ -207,7 +207,7 @@ def winners_table(groups: Sequence[GpuGroup]) -> Table:
         total = g.total(sorted_too[0]) if sorted_too else None
         first = g.group.first
         values = (
-            g.gpu_title,
+            g.gpu,
             first.transfer.upper(),
             tables.dataset_name(first.dataset),
             g.group.label(alone[0]),
@@ -244,7 +244,7 @@ def ranking(g: GpuGroup) -> Table:
         _RANGE,
         _modelled("bound", Quantity.TEXT, explain="the unit that takes most of the time"),
         _modelled("calibration", Quantity.TEXT, explain="empty where the rates that bind are known", under=True),
-        _modelled("per sort", Quantity.SECONDS, "less", "preprocessing done once per sort"),
+        _modelled("per sort", Quantity.SECONDS, None, "preprocessing done once per sort"),
         _RANGE,
         _modelled("sort and transfer", Quantity.SECONDS, "less", "a sort and one transfer, clearing included"),
         _RANGE,
@@ -259,6 +259,7 @@ def ranking(g: GpuGroup) -> Table:
     rows = []
     for record, rank, rank_total in zip(g.runs, alone, with_sort, strict=True):
         time, costs, even = g.profile(record).time, g.costs(record), break_even(g, record)
+        sort = costs.per_sort if costs is not None and costs.per_sort.seconds else None
         values = (
             rank,
             rank_total,
@@ -268,12 +269,12 @@ def ranking(g: GpuGroup) -> Table:
             (time.low, time.high),
             unit_label(time.bound),
             "" if time.calibrated else UNCALIBRATED,
-            costs and costs.per_sort.seconds,
-            costs and (costs.per_sort.low, costs.per_sort.high),
+            sort and sort.seconds,
+            sort and (sort.low, sort.high),
             costs and costs.total.seconds,
             costs and (costs.total.low, costs.total.high),
             even and even[0],
-            even and even[1:],
+            even[1:] if even and even[1] != even[2] else None,
         )
         rows.append(_row(values, columns, baseline=record is g.baseline))
     notes = [HOW_RANKED] if len(g.runs) > 1 else []

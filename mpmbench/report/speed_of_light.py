@@ -125,7 +125,7 @@ def _roofline(chart: Roofline) -> str:
     knees = [chart.peak / level.rate for level in chart.levels]
     spots = [level.intensity for level in chart.levels]
     left, right = min(*knees, *spots) / 3, max(*knees, *spots) * 3
-    legend_height = 0.2 * len(chart.levels) + 0.1
+    legend_height = 0.18 * len(chart.levels)
     height = 2.5 + legend_height
     figure = Figure((WIDTH, height))
     axes = figure.add_axes((0.13, (legend_height + 0.5) / height, 0.84, 1.9 / height))
@@ -157,6 +157,6 @@ def _plain_numbers(axes: Any, words: Callable[[float], str]) -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(LogLocator(numticks=6))
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=8))
         axis.set_major_formatter(FuncFormatter(lambda value, _: words(value)))
         axis.set_minor_formatter(NullFormatter())
