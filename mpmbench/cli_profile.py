@@ -113,7 +113,7 @@ def _print_profiles(records: Sequence[Record]) -> None:
     for g in modelled.gpu_groups(records):
         console.print(g.title, markup=False, soft_wrap=True, style="bold")
         for record in g.runs:
-            card = profile.card(g, record, charts=False, lines=False)
+            card = profile.card(g, record, detailed=False)
             badge = f"; uncalibrated: {card.badge}" if card.badge else ""
             console.print(f"  {card.title}: {card.headline}{badge}", markup=False, soft_wrap=True)
             console.print(f"    {card.sentence}", markup=False, soft_wrap=True)

@@ -40,7 +40,7 @@ def test_one_line_and_one_sentence_per_strategy(modelled):
     lines = ran.stdout.splitlines()
     at = next(i for i, line in enumerate(lines) if line.startswith("  p2g_block_sync"))
     assert lines[at] == (
-        "  p2g_block_sync: 3.05 ms (2.29 ms to 3.81 ms) modelled on NVIDIA GeForce GTX 970; bound: issue; "
+        "  p2g_block_sync: 3.05 ms (2.29 to 3.81 ms) modelled on NVIDIA GeForce GTX 970; bound: issue; "
         "44 of 64 warps per SM, limited by shared memory"
     )
     assert lines[at + 1].startswith("    Bound by instruction issue, 100 % of the time or, within the model's range")

@@ -108,11 +108,20 @@ def test_gpus_and_datasets_stay_apart_and_the_gpu_leads():
     records = strategies(GPUS) + strategies(GPUS, dataset=other)
     groups = gpu_groups(records)
     assert [(g.gpu, g.group.first.dataset.name) for g in groups] == [
-        ("gtx970", "uniform_cube"), ("a100", "uniform_cube"), ("gtx970", "random"), ("a100", "random"),
+        ("gtx970", "uniform_cube"), ("gtx970", "random"), ("a100", "uniform_cube"), ("a100", "random"),
     ]  # fmt: skip
     table = modelled.winners_table(groups)
     assert column(table, "GPU") == ["gtx970", "gtx970", "a100", "a100"]
     assert len(gpu_groups([dataclasses.replace(r, modelled=None) for r in records])) == 0
+
+
+def test_problems_are_named_where_the_dataset_does_not_tell_them_apart():
+    double = [dataclasses.replace(r, axes={**r.axes, "dtype": "float64"}) for r in strategies()]
+    (single,) = gpu_groups(strategies())
+    assert single.title == "P2G on uniform_cube (4 per cell), NVIDIA GeForce GTX 970"
+    titles = [g.title for g in gpu_groups([*strategies(), *double])]
+    assert len(set(titles)) == 2
+    assert "1,000,000 particles, cubic, pic, float64, compiled for sm_52" in titles[1]
 
 
 def test_what_failed_has_no_place():
@@ -179,7 +188,7 @@ def test_uncalibrated_times_say_why():
     (row,) = [r for t in tables_of(doc) if t.title.startswith("Modelled") and "A100" in t.title for r in t.rows
               if "atomics" in [c.value for c in r.cells]]  # fmt: skip
     assert "uncalibrated" in [c.value for c in row.cells]
-    cards = section(doc, "Profile: P2G on uniform_cube (4 per cell), 1,000,000 particles, cubic, pic, float32, on NVI")
+    cards = section(doc, "Profile: P2G on uniform_cube (4 per cell), NVIDIA GeForce")
     assert not any(card.badge for card in cards.cards)  # of the GTX 970
 
 
@@ -190,9 +199,9 @@ def test_the_answer_names_gpu_time_range_and_doubt():
     doc = document.build(strategies())
     assert doc.answer[0].startswith("No GPU took part")
     assert doc.answer[1] == (
-        "Modelled, P2G on uniform_cube (4 per cell), 1,000,000 particles, cubic, pic, float32, on NVIDIA GeForce GTX "
-        "970: p2g_block_sync, 3.05 ms (2.29 ms to 3.81 ms), 14.6 times as fast as unsorted p2g_global_atomic (transfer "
-        "alone); within the model's error of p2g_block_pull."
+        "Modelled, P2G on uniform_cube (4 per cell), NVIDIA GeForce GTX 970: p2g_block_sync, 3.05 ms "
+        "(2.29 to 3.81 ms), 14.6 times as fast as unsorted p2g_global_atomic (transfer alone); within the "
+        "model's error of p2g_block_pull."
     )
     assert doc.sections[0].title == "What would it do on my GPU?"
     assert doc.sections[1].title.startswith("Profile: P2G")
@@ -236,6 +245,22 @@ def test_no_roofline_without_what_it_stands_on(changes):
     made = record(profiles=(profile(modelled_time("gtx970", "issue", 1e-3), **changes),))
     assert speed_of_light.roofline(made, made.modelled["gtx970"]) is None
     assert html_text([made])
+
+
+@pytest.mark.parametrize(
+    ("value", "quantity", "text"),
+    [
+        ((1e-3, 2e-3), Quantity.SECONDS_RANGE, "1 to 2 ms"),
+        ((9e-4, 2e-3), Quantity.SECONDS_RANGE, "900 µs to 2 ms"),
+        ((1e-3, 1e-3), Quantity.SECONDS_RANGE, "1 ms"),
+        (None, Quantity.SECONDS_RANGE, "–"),
+        ((1, 1), Quantity.TRANSFERS_RANGE, "at once"),
+        ((1, math.inf), Quantity.TRANSFERS_RANGE, "at once to never"),
+        ((2, 1500), Quantity.TRANSFERS_RANGE, "2 to 1,500"),
+    ],
+)
+def test_ranges_as_text(value, quantity, text):
+    assert format_value(value, quantity) == text
 
 
 # ---- pages -----------------------------------------------------------------------------------------------------
@@ -303,7 +328,7 @@ def test_a_primitive_has_a_profile_and_no_ranking():
     made = record("scan_shuffle", (profile(modelled_time("gtx970", "dram", 1e-4)),), transfer="scan")
     doc = document.build([made])
     assert not [s for s in doc.sections if s.title.startswith("What would")]
-    assert section(doc, "Profile: Scan on uniform_cube, 1,000,000 elements, on NVIDIA")
+    assert section(doc, "Profile: Scan on uniform_cube (4 per cell), NVIDIA").intro.startswith("1,000,000 elements, ")
 
 
 def test_records_without_profiles_make_the_page_they_made():

@@ -110,7 +110,10 @@ def build(records: Sequence[Record], extent: Extent = EXTENTS[0]) -> Document:
     transfers = [record for record in records if record.is_transfer]
     groups = tables.group(transfers)
     on_gpus = modelled.gpu_groups(records)
-    sections = _modelled_sections(on_gpus, extent)
+    on_gpus_transfers = [g for g in on_gpus if g.group.first.is_transfer][: extent.groups]
+    sections = [_on_my_gpu(on_gpus_transfers)] if on_gpus_transfers else []
+    profiles = _profiles(on_gpus[: extent.groups], extent)
+    sections += profiles
     if any(g.ranked for g in groups):
         sections.append(Section("Answer in one table", tuple(tables.summary(groups))))
     if published := tables.presets(records):
@@ -143,9 +146,9 @@ def build(records: Sequence[Record], extent: Extent = EXTENTS[0]) -> Document:
         left_out.append(f"charts of {_plural(len(groups) - extent.charts, 'section')}")
     if extent.groups is not None and len(groups) > extent.groups:
         left_out.append(_plural(len(groups) - extent.groups, "section"))
-    profiled = sum(len(g.runs) for g in on_gpus)
-    if extent.cards < profiled:
-        left_out.append(f"charts and lines of {_plural(profiled - extent.cards, 'profile')}")
+    plain = sum(len(g.runs) for g in on_gpus) - sum(card.detailed for s in profiles for card in s.cards)
+    if plain:
+        left_out.append(f"charts and lines of {_plural(plain, 'profile')}")
     verdict, agreed = _verdict(records)
     return Document(
         title="mpmbench report",
@@ -317,29 +320,28 @@ def _where(places: list[str]) -> str:
 RANKINGS_IN_SIGHT = 2  # more of them are folded away
 
 
-def _modelled_sections(on_gpus: Sequence[GpuGroup], extent: Extent) -> list[Section]:
-    """Who wins on which GPU, then what binds each strategy there."""
+def _on_my_gpu(groups: Sequence[GpuGroup]) -> Section:
+    """Who wins on which GPU, and every ranking."""
+    rankings = [modelled.ranking(g) for g in groups]
+    in_sight = len(rankings) <= RANKINGS_IN_SIGHT
+    problems = list(dict.fromkeys(g.problem for g in groups))
+    return Section(
+        title="What would it do on my GPU?",
+        tables=(modelled.winners_table(groups), *(rankings if in_sight else ())),
+        details=() if in_sight else tuple(Details(t.title, (_untitled(t),)) for t in rankings),
+        intro=(f"{problems[0]}. " if len(problems) == 1 else "") + modelled.EXPLANATION,
+    )
+
+
+def _profiles(groups: Sequence[GpuGroup], extent: Extent) -> list[Section]:
+    """What binds each strategy on each GPU. Charts go to the fastest of every group alike."""
+    each, more = divmod(extent.cards, len(groups)) if groups else (0, 0)
     sections = []
-    transfers = [g for g in on_gpus if g.group.first.is_transfer]
-    if transfers:
-        rankings = [modelled.ranking(g) for g in transfers[: extent.groups]]
-        shown, details = tuple(rankings), ()
-        if len(rankings) > RANKINGS_IN_SIGHT:
-            shown, details = (), tuple(Details(t.title, (_untitled(t),)) for t in rankings)  # type: ignore[assignment]
-        intro = (
-            "Times are modelled, not measured, each with the range that the model claims; where ranges overlap, the "
-            "order is within its error. A transfer alone, and with the sort that it needs."
-        )
-        winners = modelled.winners_table(transfers)
-        sections.append(Section("What would it do on my GPU?", (winners, *shown), (), details, intro))
-    left = extent.cards
-    for g in on_gpus[: extent.groups]:
-        drawn = g.runs[:left]
-        left -= len(drawn)
-        shown = tuple(filter(None, (profile.overview(g), profile.metrics(g), profile.traffic(g))))
-        cards = tuple(profile.card(g, r) for r in drawn)
-        cards += tuple(profile.card(g, r, charts=False, lines=False) for r in g.runs[len(drawn) :])
-        intro = profile.EXPLANATION.format(gpu=g.gpu_title)
+    for i, g in enumerate(groups):
+        charted = each + (i < more)
+        cards = tuple(profile.card(g, r, detailed=place < charted) for place, r in enumerate(g.runs[: extent.rows]))
+        shown = tuple(table for table in (profile.overview(g), profile.metrics(g), profile.traffic(g)) if table)
+        intro = f"{g.problem}. {profile.EXPLANATION.format(gpu=g.gpu_title)}"
         sections.append(Section(f"Profile: {g.title}", shown, intro=intro, cards=cards))
     return sections
 

@@ -5,6 +5,7 @@ Rank 1 means: no other strategy is surely faster. Two whose ranges overlap canno
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,6 +20,11 @@ from mpmbench.report.table import Cell, Column, Group, Kind, Quantity, Row, Spli
 from mpmbench.report.text import number, range_text, seconds_text
 
 NAMED_TIES = 2
+
+EXPLANATION = (
+    "Times are modelled, not measured, each with the range that the model claims; where ranges overlap, the order is "
+    "within its error. A transfer alone, and with the sort that it needs."
+)
 UNCALIBRATED = "uncalibrated"
 
 HOW_RANKED = (
@@ -65,10 +71,14 @@ class Costs:
 
 @dataclass(frozen=True)
 class GpuGroup:
-    """Runs of one group whose time is modelled on one GPU, the fastest first."""
+    """Runs of one group whose time is modelled on one GPU, the fastest first.
+
+    alone: whether no other group has the same transfer, dataset and GPU, so that these name it.
+    """
 
     group: Group
     gpu: str
+    alone: bool = True
 
     @cached_property
     def runs(self) -> tuple[Record, ...]:
@@ -85,9 +95,19 @@ class GpuGroup:
 
     @property
     def title(self) -> str:
-        """Problem and GPU."""
-        title = self.group.title if self.group.first.is_transfer else primitive_title(self.group.first)
-        return f"{title}, on {self.gpu_title}"
+        """Problem and GPU, as short as tells it from the others."""
+        record = self.group.first
+        what = record.transfer.upper() if record.is_transfer else record.transfer.replace("_", " ").capitalize()
+        words = [f"{what} on {tables.dataset_name(record.dataset)}", "" if self.alone else self.problem, self.gpu_title]
+        return ", ".join(filter(None, words))
+
+    @property
+    def problem(self) -> str:
+        """Size, and the axes that make a problem."""
+        record = self.group.first
+        size = f"{record.dataset.n:,} {'particles' if record.is_transfer else 'elements'}"
+        words = [str(record.axes[axis]) for axis in tables.PROBLEM_AXES if axis in record.axes]
+        return ", ".join([size, *words, f"compiled for {record.arch}"])
 
     @property
     def baseline(self) -> Record | None:
@@ -113,17 +133,19 @@ class GpuGroup:
         return None if costs is None else costs.total
 
 
-def primitive_title(record: Record) -> str:
-    return f"{record.transfer.replace('_', ' ').capitalize()} on {record.dataset.name}, {record.dataset.n:,} elements"
-
-
 def gpu_groups(records: Iterable[Record]) -> list[GpuGroup]:
-    """Every group on every GPU that its records name: by dataset, then transfer, then GPU."""
-    found = []
-    for g in tables.group(records):
-        for gpu in dict.fromkeys(gpu for r in g.ranked for gpu in r.modelled or {}):
-            found.append(GpuGroup(g, gpu))
-    return found
+    """Every group on every GPU that its records name: by GPU, then dataset, then transfer."""
+    pairs = [
+        (g, gpu)
+        for g in tables.group(records)
+        for gpu in dict.fromkeys(gpu for r in g.ranked for gpu in r.modelled or {})
+    ]
+    gpus = list(dict.fromkeys(gpu for _, gpu in pairs))
+    names = Counter((g.first.transfer, tables.dataset_name(g.first.dataset), gpu) for g, gpu in pairs)
+    found = [
+        GpuGroup(g, gpu, names[g.first.transfer, tables.dataset_name(g.first.dataset), gpu] == 1) for g, gpu in pairs
+    ]
+    return sorted(found, key=lambda g: gpus.index(g.gpu))
 
 
 # ---- ranks -------------------------------------------------------------------------------------------------
@@ -198,9 +220,8 @@ def winners_table(groups: Sequence[GpuGroup]) -> Table:
         Column("particles", Kind.NAME, Quantity.COUNT),
         Column("problem", Kind.NAME, Quantity.TEXT),
     )
-    gpus = list(dict.fromkeys(g.gpu for g in groups))
     rows = []
-    for g in sorted(groups, key=lambda g: gpus.index(g.gpu)):
+    for g in groups:
         alone, sorted_too = winners(g, g.transfer), winners(g, g.total)
         time = g.transfer(alone[0])
         base = g.baseline and g.transfer(g.baseline).seconds

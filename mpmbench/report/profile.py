@@ -25,7 +25,8 @@ EXPLANATION = (
 
 @dataclass(frozen=True)
 class Card:
-    """One strategy on one GPU. badge: why its time is uncalibrated; empty if it is not."""
+    """One strategy on one GPU. badge: why its time is uncalibrated; empty if it is not.  detailed: whether charts and
+    lines were asked for."""
 
     title: str
     headline: str
@@ -33,14 +34,16 @@ class Card:
     badge: str = ""
     charts: tuple[SpeedOfLight | Roofline, ...] = ()
     tables: tuple[Table, ...] = ()
+    detailed: bool = True
 
 
-def card(g: GpuGroup, record: Record, charts: bool = True, lines: bool = True) -> Card:
+def card(g: GpuGroup, record: Record, detailed: bool = True) -> Card:
+    """detailed: with charts and hottest lines."""
     profile = g.profile(record)
     time, held = profile.time, profile.occupancy
     limiter = "" if held.warps >= held.max_warps else f", limited by {held.limiter}"
-    drawn = [speed_of_light(profile), roofline(record, profile)] if charts else []
-    hottest = hottest_lines(record, profile) if lines else None
+    drawn = [speed_of_light(profile), roofline(record, profile)] if detailed else []
+    hottest = hottest_lines(record, profile) if detailed else None
     return Card(
         title=g.group.label(record),
         headline=f"{Span.of(time).text} modelled on {profile.title}; bound: {unit_label(time.bound)}; "
@@ -49,6 +52,7 @@ def card(g: GpuGroup, record: Record, charts: bool = True, lines: bool = True) -
         badge="" if time.calibrated else (time.reason or UNCALIBRATED),
         charts=tuple(chart for chart in drawn if chart is not None),
         tables=() if hottest is None else (hottest,),
+        detailed=detailed,
     )
 
 

@@ -82,9 +82,12 @@ def seconds_text(value: float) -> str:
 
 
 def range_text(low: float, high: float, words: Callable[[float], str]) -> str:
-    """Both ends, once where they read the same."""
+    """Both ends, once where they read the same; their unit once where they share it."""
     first, last = words(low), words(high)
-    return first if first == last else f"{first} to {last}"
+    if first == last:
+        return first
+    (value, *unit), (_, *other) = first.split(), last.split()
+    return f"{value} to {last}" if unit == other else f"{first} to {last}"
 
 
 def transfers_text(value: float) -> str:
