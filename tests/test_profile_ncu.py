@@ -21,9 +21,10 @@ RAW = """==PROF== Connected to process 7 (/usr/bin/python3.11)
 "smsp__inst_executed.sum","sm__unheard_of.sum"
 "","","","","","","","","","","","sector","nsecond","sector","sector","register/thread","%","inst","furlong"
 "0","7","python3.11","host","p2g_block_sync(Domain, int)","1","7","(128, 1, 1)","(900, 1, 1)","0","9.0",\
-"1,500,000","2,000,000","0","4,500,000","48","50.25","16,000,000","oddities"
+"1,500,000","2,000,000","500,000","4,000,000","48","50.25","16,000,000","oddities"
 "1","7","python3.11","host","p2g_block_sync(Domain, int)","1","7","(128, 1, 1)","(900, 1, 1)","0","9.0",\
-"1,500,000","4,000,000","0","4,500,000","48","50.25","16,000,000","1"
+"1,500,000","4,000,000","500,000","4,000,000","48","50.25","16,000,000","1"
+1 row written, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23
 """
 
 _DETAILS_HEAD = (
@@ -56,8 +57,8 @@ def test_raw_page(tmp_path):
     assert measured.values == {
         "gpu__time_duration.sum": pytest.approx(3e-3),  # median of 2 and 4 ms
         "dram__sectors_read.sum": 1_500_000,
-        "l1tex__t_sectors_pipe_lsu_mem_global_op_atom.sum": 0,
-        "l1tex__t_sectors_pipe_lsu_mem_global_op_red.sum": 4_500_000,
+        "l1tex__t_sectors_pipe_lsu_mem_global_op_atom.sum": 500_000,
+        "l1tex__t_sectors_pipe_lsu_mem_global_op_red.sum": 4_000_000,
         "launch__registers_per_thread": 48,
         "lts__t_sector_hit_rate.pct": 50.25,
         "smsp__inst_executed.sum": 16_000_000,
