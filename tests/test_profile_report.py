@@ -124,6 +124,16 @@ def test_problems_are_named_where_the_dataset_does_not_tell_them_apart():
     assert "1,000,000 particles, cubic, pic, float64, compiled for sm_52" in titles[1]
 
 
+def test_records_of_two_architectures_are_told_apart():
+    """One simulation per architecture: the counts of each have a section and a row of their own."""
+    hopper = [dataclasses.replace(r, arch="sm_90") for r in strategies(("h100",))]
+    doc = document.build([*strategies(), *hopper])
+    titles = [s.title for s in doc.sections]
+    assert len(set(titles)) == len(titles)
+    assert [column(t, "compiled for") for t in section(doc, "Answer").tables] == [["sm_52", "sm_90"]]
+    assert column(section(doc, "What would").tables[0], "GPU") == ["gtx970", "h100"]
+
+
 def test_what_failed_has_no_place():
     wrong = dataclasses.replace(strategies()[2], failed_because="launch error")
     (g,) = gpu_groups([*strategies()[:2], wrong])

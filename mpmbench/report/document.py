@@ -371,7 +371,7 @@ def _group_section(g: Group, extent: Extent, charted: bool, name_device: bool) -
     intro = f"{g.device[0].upper()}{g.device[1:]}."
     if g.shared:
         intro += f" All runs: {tables.axes_text(g.shared)}."
-    where = ("simulated" if g.simulated else g.device) if name_device else ""
+    where = (f"simulated {g.first.arch}" if g.simulated else g.device) if name_device else ""
     title = ", ".join(filter(None, [g.title, where]))
     return Section(title, tuple(shown), tuple(charts), tuple(details), intro)
 

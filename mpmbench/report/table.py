@@ -800,6 +800,8 @@ def _summary(groups: Sequence[Group], by: Sequence[tuple[str, Callable[[Tally], 
             Column(f"{name}, baseline / this", Kind.SIMULATED, Quantity.FACTOR),
         ]
     columns += _AFTER
+    several = len({g.first.arch for g in groups}) > 1
+    columns += [Column("compiled for", Kind.NAME, Quantity.TEXT)] * several
     rows = []
     for g in groups:
         values = _before(g)
@@ -808,7 +810,7 @@ def _summary(groups: Sequence[Group], by: Sequence[tuple[str, Callable[[Tally], 
             count = counter(best.transfer_counters.total)  # type: ignore[union-attr]
             base = g.baseline and counter(g.baseline.transfer_counters.total)  # type: ignore[union-attr]
             values += [g.label(best), count / (particles(best) or 1), base / count if base and count else None]
-        rows.append(_row(values + _after(g), columns))
+        rows.append(_row(values + _after(g) + [g.first.arch] * several, columns))
     return Table("Fewest sectors and fewest warp instructions: simulated, not time", tuple(columns), tuple(rows))
 
 
