@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 
 from mpmbench.simt.counters import SourceLine
@@ -26,6 +27,9 @@ class Machine:
     l2_latency: int
     dram_latency: int
     barrier_latency: int
+    block_start: int = 0  # cycles between the end of a thread block and the start of the next one in its place
+    # What a warp takes of its SM's issue slots for a PTX instruction [cycles]: a quarter where four warps issue at once.
+    issue_cycles: Callable[[str], float] = lambda opcode: 0.25
 
 
 @dataclass

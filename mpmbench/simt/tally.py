@@ -67,3 +67,14 @@ def counters_from(facts: _Description, words: np.ndarray) -> Counters:
     for entry in counters.lines.values():
         counters.total += entry
     return counters
+
+
+def opcodes_from(facts: _Description, words: np.ndarray) -> dict[str, int]:
+    """Executions by a warp of each PTX opcode. words: as above."""
+    executions: dict[str, int] = {}
+    segments = words[: SEGMENT_WORDS * len(facts.segments)].reshape(-1, SEGMENT_WORDS)[:, 0].tolist()
+    for (start, stop), times in zip(facts.segments, segments, strict=True):
+        if times:
+            for opcode in facts.opcodes[start:stop]:
+                executions[opcode] = executions.get(opcode, 0) + times
+    return executions
