@@ -27,6 +27,7 @@ class KernelInfo:
     shared_bytes: int | None = None  # static, per thread block
     local_bytes: int | None = None  # stack per thread
     spill_bytes: int | None = None  # spill stores + spill loads per thread
+    sass_instructions: int | None = None  # machine instructions in the code, each counted once
 
 
 @dataclass(frozen=True)
