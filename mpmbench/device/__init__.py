@@ -60,7 +60,7 @@ class LaunchProfile:
     """One launch on a modelled machine: all that a performance model needs.
 
     blocks, threads: thread blocks of the launch, threads of each.  shared_bytes: static and dynamic, per thread block.
-    opcodes: executions by a warp of each PTX opcode.
+    opcodes: executions by a warp of each PTX opcode with each integer literal (None: without).
     """
 
     entry: str
@@ -70,7 +70,7 @@ class LaunchProfile:
     info: KernelInfo
     counters: Counters
     memory: MemoryCounters
-    opcodes: Mapping[str, int] = field(repr=False)
+    opcodes: Mapping[tuple[str, int | None], int] = field(repr=False)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import lru_cache
 
-from mpmbench.simt.ptx import Imm, Instruction
+from mpmbench.simt.ptx import Instruction
 
 # "control" and "move" cost an issue slot and no unit that could bind; the others have a rate in GPU descriptions.
 CLASSES = (
@@ -46,8 +46,7 @@ def is_shared_float_add(opcode: str) -> bool:
 
 def instruction_weight(instruction: Instruction, arch: str) -> tuple[str, float]:
     """``weight`` of a parsed instruction."""
-    literals = [operand.value for operand in instruction.srcs if isinstance(operand, Imm) and not operand.float_bits]
-    return weight(instruction.opcode, arch, literals[-1] if literals else None)
+    return weight(instruction.opcode, arch, instruction.literal)
 
 
 @lru_cache(maxsize=65536)

@@ -41,13 +41,14 @@ _MAX_SHARED = 227 * 1024  # of the largest GPU (Hopper)
 class LaunchResult:
     """counters: in modes ``count`` and ``profile``; findings: defects seen, in any mode. memory: in mode ``profile``.
 
-    opcodes: how often warps executed each PTX opcode, where counters are kept.
+    opcodes: how often warps executed each PTX opcode with each integer literal (None: without), where counters are
+    kept.
     """
 
     counters: Counters | None
     findings: tuple[Finding, ...]
     memory: MemoryCounters | None = None
-    opcodes: Mapping[str, int] = field(default_factory=dict)
+    opcodes: Mapping[tuple[str, int | None], int] = field(default_factory=dict)
 
 
 def compile_ptx(text: str, mode: str = "run", lane_width: int = 16) -> Module:
@@ -105,6 +106,7 @@ class _Description:
     shared_granule: int
     lines: list[tuple[str, int] | None]
     opcodes: list[str]
+    literals: list[int | None]  # last integer literal among the operands of each instruction
     guarded: list[bool]
 
 
@@ -346,6 +348,7 @@ def _describe(module: ptx.Module, kernel: ptx.Kernel, code: KernelCode) -> _Desc
         shared_granule=code.shared_granule,
         lines=code.lines,
         opcodes=[item.opcode for item in kernel.instructions],
+        literals=[item.literal for item in kernel.instructions],
         guarded=[item.guard is not None for item in kernel.instructions],
     )
 

@@ -94,8 +94,8 @@ _READY, _REPLAYING, _WAITING, _ENDED = range(4)
 # barrier opened, and what its warps had taken by then of the issue slots and of the shared-memory pipe.
 _RUNNING, _AT_BARRIER, _STARTED, _OPENED, _ISSUED, _SHARED_TAKEN = range(6)
 
-# Outcomes of a replay.
-_FAULT, _STOP_SLOT, _STOP_WARP, _LATENCY_CYCLES, _WARP_CYCLES, _BARRIER_WAIT, _PEAK_WARPS = range(7)
+# Outcomes of a replay; the last one is followed by waits for L1, L2 and DRAM.
+_FAULT, _STOP_SLOT, _STOP_WARP, _LATENCY_CYCLES, _WARP_CYCLES, _BARRIER_WAIT, _PEAK_WARPS, _WAITS = range(8)
 
 _JOB_WORDS = JOB_BYTES // 8
 _JOB_SHARED, _JOB_LOCAL, _JOB_LOCAL_END = (scheduler.JOB[name] // 8 for name in ("shared", "local", "local_end"))
@@ -264,24 +264,27 @@ def _start_block(launch, contexts, halves, jobs, warps, slots, slot, block, star
 
 
 @inlined
-def _wait_for_loads(warps, pending, warp, clock, until):
+def _wait_for_loads(warps, pending, outcome, warp, clock, until):
     """Stall a warp for the values that it needs up to a cycle of the segment that began at ``clock``."""
     kept = 0
     for number in range(warps[warp, _PENDING_COUNT]):
         done, use = pending[warp, number, 0], pending[warp, number, 1]
         if use <= until:
-            warps[warp, _OFFSET] += max(np.int64(0), done - (clock + use + warps[warp, _OFFSET]))
+            stall = max(np.int64(0), done - (clock + use + warps[warp, _OFFSET]))
+            warps[warp, _OFFSET] += stall
+            outcome[_WAITS + pending[warp, number, 2]] += stall
         else:
             pending[warp, kept, 0] = done
             pending[warp, kept, 1] = use
+            pending[warp, kept, 2] = pending[warp, number, 2]
             kept += 1
     warps[warp, _PENDING_COUNT] = kept
 
 
 @inlined
-def _arrive(warps, slots, pending, slot, warp, clock):
+def _arrive(warps, slots, pending, outcome, slot, warp, clock):
     """The warp has replayed everything up to a barrier or its end."""
-    _wait_for_loads(warps, pending, warp, warps[warp, _PENDING_CLOCK], _ALL_USES)
+    _wait_for_loads(warps, pending, outcome, warp, warps[warp, _PENDING_CLOCK], _ALL_USES)
     warps[warp, _ARRIVAL] = clock + warps[warp, _OFFSET]
     at_barrier = warps[warp, _STATUS_OF] == _STATUS_BARRIER
     warps[warp, _STATE] = _WAITING if at_barrier else _ENDED
@@ -303,7 +306,7 @@ def replay(
     total = slot_count * count
     warps = np.zeros((total, 12), np.int64)
     slots = np.zeros((slot_count, 6), np.int64)
-    pending = np.zeros((total, _PENDING, 2), np.int64)
+    pending = np.zeros((total, _PENDING, 3), np.int64)
     saved = np.zeros((total, 64), np.int64)
     covered = np.zeros(64, np.int64)
     table = np.zeros(128, np.int64)
@@ -357,7 +360,7 @@ def replay(
                         _push(heap, heap_size, key, warp)
                         heap_size += 1
                     elif status != _STATUS_YIELD:
-                        _arrive(warps, slots, pending, slot, warp, contexts[at + _CLOCK])
+                        _arrive(warps, slots, pending, outcome, slot, warp, contexts[at + _CLOCK])
         else:
             # Replay the earliest request.
             now, warp = heap[0, 0], heap[0, 1]
@@ -369,10 +372,10 @@ def replay(
             clock = traces[at, RECORD_CLOCK]
             kind, width = facts[site, _KIND], facts[site, _WIDTH]
             if clock != warps[warp, _PENDING_CLOCK]:
-                _wait_for_loads(warps, pending, warp, warps[warp, _PENDING_CLOCK], _ALL_USES)
+                _wait_for_loads(warps, pending, outcome, warp, warps[warp, _PENDING_CLOCK], _ALL_USES)
                 warps[warp, _PENDING_CLOCK] = clock
             elif warps[warp, _PENDING_COUNT] > 0:
-                _wait_for_loads(warps, pending, warp, clock, issue[site])
+                _wait_for_loads(warps, pending, outcome, warp, clock, issue[site])
 
             # A run of atomics on neighbouring words is as many requests, of the same sectors if no lane's run has two.
             if word == 0:
@@ -423,10 +426,11 @@ def replay(
             warps[warp, _QUEUED] += begin - now
             if use[site] != NEVER:
                 if warps[warp, _PENDING_COUNT] == _PENDING:
-                    _wait_for_loads(warps, pending, warp, clock, _ALL_USES)
+                    _wait_for_loads(warps, pending, outcome, warp, clock, _ALL_USES)
                 number = warps[warp, _PENDING_COUNT]
                 pending[warp, number, 0] = clock + issue[site] + warps[warp, _OFFSET] + latency
                 pending[warp, number, 1] = use[site]
+                pending[warp, number, 2] = 0 if exchanged == 0 else 1 if latency < dram_latency else 2
                 warps[warp, _PENDING_COUNT] = number + 1
 
             if word + 1 < run:
@@ -448,7 +452,7 @@ def replay(
                 todo[todo_count] = slot
                 todo_count += 1
                 continue
-            _arrive(warps, slots, pending, slot, warp, contexts[warp * words + _CLOCK])
+            _arrive(warps, slots, pending, outcome, slot, warp, contexts[warp * words + _CLOCK])
 
         if slots[slot, _RUNNING] > 0:
             continue
@@ -567,7 +571,7 @@ class MemorySystem:
         )  # fmt: skip
         atomics = any(site.kind == "atomic" and site.space != "shared" for site in facts.sites)
         hot = np.zeros(device_bytes // 4 + 1 if atomics else 1, np.int32)
-        outcome = np.zeros(8, np.int64)
+        outcome = np.zeros(_WAITS + 3, np.int64)
         if blocks:
             replay(
                 launch, self._words, self._site_facts, self._tables.issue, self._tables.use, contexts,
@@ -586,6 +590,9 @@ class MemorySystem:
             latency_cycles=int(outcome[_LATENCY_CYCLES]),
             warp_cycles=int(outcome[_WARP_CYCLES]),
             barrier_wait_cycles=int(outcome[_BARRIER_WAIT]),
+            l1_wait_cycles=int(outcome[_WAITS]),
+            l2_wait_cycles=int(outcome[_WAITS + 1]),
+            dram_wait_cycles=int(outcome[_WAITS + 2]),
             resident_warps=int(outcome[_PEAK_WARPS]),
         )
         for site, row in zip(self._facts.sites, self._tallies.tolist(), strict=False):

@@ -97,7 +97,7 @@ def _run_segment(
     for site in loaded_by.values():
         if tables.use[site] == NEVER:
             tables.use[site] = now
-    slots = sum(machine.issue_cycles(item.opcode) for item in instructions[start:stop])
+    slots = sum(machine.issue_cycles(item) for item in instructions[start:stop])
     tables.segments[number] = max(now, 1), round(slots * ISSUE_UNITS)
 
 
