@@ -282,8 +282,8 @@ def test_without_a_gpu_nothing_is_written(tmp_path: Path, monkeypatch: pytest.Mo
 
 @pytest.mark.parametrize(
     ("arch", "sms", "expected"),
-    [("sm_90", 132, "h100_sxm"), ("sm_90", 114, "h100"), ("sm_86", 28, "rtx3090"), ("sm_75", 40, "v100"), ("sm_88", 10, "rtx3090"),
-     ("sm_61", 28, "gtx970"), ("sm_120", 170, "h100_sxm"), ("sm_50", 5, "gtx970")],
+    [("sm_90", 132, "h100_sxm"), ("sm_90", 114, "h100"), ("sm_86", 28, "rtx3090"), ("sm_75", 40, "v100"),
+     ("sm_88", 10, "rtx3090"), ("sm_61", 28, "gtx970"), ("sm_120", 170, "h100_sxm"), ("sm_50", 5, "gtx970")],
 )  # fmt: skip
 def test_what_is_unknown_comes_from_a_similar_gpu(arch: str, sms: int, expected: str) -> None:
     assert most_similar(arch, sms).name == expected
