@@ -419,10 +419,25 @@ def verify(
 
 
 @main.command()
-def doctor() -> None:
+@click.option(
+    "--write-gpu",
+    "gpu_path",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.toml",
+    help="Describe this machine's GPU for --gpu FILE.toml instead; an existing file is left alone.",
+)
+def doctor(gpu_path: Path | None) -> None:
     """What is present, what is missing, and what to do about it."""
     from mpmbench.doctor import diagnose
 
+    if gpu_path is not None:
+        from mpmbench.gpu.write import write_gpu
+
+        gpu = write_gpu(gpu_path)
+        unknown = sum(constant.confidence == "low" for constant in gpu.constants.values())
+        console.print(f"wrote {gpu_path}: {gpu.summary}", markup=False, soft_wrap=True)
+        console.print(f"{unknown} constants are not known for this GPU: those of confidence low", soft_wrap=True)
+        return
     marks = {"ok": "[green]ok     [/]", "warn": "[yellow]warn   [/]", "missing": "[red]missing[/]"}
     for item in diagnose():
         console.print(f"{marks[item.status]} {item.name}: ", end="")

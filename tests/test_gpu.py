@@ -119,6 +119,37 @@ def test_the_shared_memory_carved_out_of_l1(name, blocks, shared, expected):
         ("v100", 64, 40, 0, Occupancy(24, 48, "registers")),
         ("a100", 1024, 33, 0, Occupancy(1, 32, "registers")),
         ("h200", 128, 32, 300_000, Occupancy(0, 0, "shared memory")),
+        # 72 registers: 2,304 per warp; 28.4 -> 28 warps in groups of four, no thread block of 32.
+        ("gtx970", 1024, 72, 0, Occupancy(0, 0, "registers")),
+        # A warp started is a warp taken: 129 threads are 5 warps; 64 / 5 = 12.
+        ("gtx970", 129, 16, 0, Occupancy(12, 60, "warps")),
+        # 12,288 bytes fill 98,304 eight times; one more byte makes 12,544 of it: seven.
+        ("gtx970", 128, 32, 12_288, Occupancy(8, 32, "shared memory")),
+        ("gtx970", 128, 32, 12_289, Occupancy(7, 28, "shared memory")),
+        ("gtx970", 128, 32, 49_153, Occupancy(0, 0, "shared memory")),
+        # 33 registers are given out as 40: 1,056 rounds to 1,280 per warp, as 256 is the unit.
+        ("v100", 128, 33, 0, Occupancy(12, 48, "registers")),
+        ("v100", 128, 64, 8624, Occupancy(8, 32, "registers")),
+        ("v100", 128, 32, 98_304, Occupancy(1, 4, "shared memory")),
+        # 167,936 / (8,624 + 1,024 -> 9,728) = 17.3, but 16 thread blocks fill 64 warps.
+        ("a100", 128, 32, 8624, Occupancy(16, 64, "warps")),
+        # 19,968 + 1,024 = 20,992 = 164 x 128: exactly 8 of 167,936. One byte more: 21,120, 7.95.
+        ("a100", 128, 32, 19_968, Occupancy(8, 32, "shared memory")),
+        ("a100", 128, 32, 19_969, Occupancy(7, 28, "shared memory")),
+        ("a100", 128, 32, 166_912, Occupancy(1, 4, "shared memory")),
+        ("a100", 128, 128, 0, Occupancy(4, 16, "registers")),
+        # 48 warps and 16 thread blocks: one of two warps is short of blocks.
+        ("rtx3090", 64, 32, 0, Occupancy(16, 32, "blocks")),
+        ("rtx3090", 256, 40, 0, Occupancy(6, 48, "warps")),
+        ("rtx3090", 128, 32, 101_376, Occupancy(1, 4, "shared memory")),
+        ("rtx4090", 64, 32, 0, Occupancy(24, 48, "warps")),
+        ("rtx4090", 32, 32, 0, Occupancy(24, 24, "blocks")),
+        ("rtx4090", 128, 32, 8624, Occupancy(10, 40, "shared memory")),
+        ("rtx4090", 128, 255, 0, Occupancy(2, 8, "registers")),
+        # 168 registers, three groups of warps: 5,376 per warp, 12.2 -> 12 warps.
+        ("h100", 128, 168, 0, Occupancy(3, 12, "registers")),
+        ("h100", 384, 168, 0, Occupancy(1, 12, "registers")),
+        ("h100", 128, 32, 232_448, Occupancy(1, 4, "shared memory")),
     ],
 )
 def test_occupancy(name, threads, registers, shared, expected):
