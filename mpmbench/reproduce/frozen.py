@@ -1,7 +1,7 @@
 """What was fixed before a score was known: constants, kernels, datasets, and which rows are scored.
 
-One JSON file per version in ``frozen/``. A version is written once (``freeze``), gets its score once, from the first run
-that scores it (``record_score``), and is never changed after that. A run that differs from the newest version in
+One JSON file per version in ``frozen/``. A version is written once (``freeze``), gets its score once, from the first
+run that scores it (``record_score``), and is never changed after that. A run that differs from the newest version in
 anything frozen, or whose modelled times have moved since that version was scored, is post-hoc.
 """
 
@@ -42,7 +42,7 @@ class FrozenRow:
 
 @dataclass(frozen=True)
 class Frozen:
-    """One version. date: UTC.  note: the decision that explains it.  score: of the first run, with its date, or None."""
+    """One version. date: UTC.  note: the decision that explains it.  score: the first, with its date; None before."""
 
     version: str
     date: str

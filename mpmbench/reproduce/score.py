@@ -2,8 +2,8 @@
 
 Errors are log2(modelled / published), so that twice too slow and twice too fast weigh the same. Kendall's tau is
 (C - D) / (C + D) over pairs of comparable rows of one table whose published times differ by more than 5 %: C pairs are
-modelled in the printed order, D pairs are not, and a modelled tie within 1 % counts as D. ``pooled`` takes those pairs of
-all tables together; rows of different tables are never paired, since they do not answer one question. A table with
+modelled in the printed order, D pairs are not, and a modelled tie within 1 % counts as D. ``pooled`` takes those pairs
+of all tables together; rows of different tables are never paired, since they do not answer one question. A table with
 fewer than six such pairs has no tau of its own.
 """
 
@@ -94,13 +94,12 @@ def score(judged: Sequence[Judged]) -> Score:
 def pairs(judged: Sequence[Judged]) -> Pairs:
     """Of rows of one table."""
     concordant = discordant = 0
-    timed = [(one.row.published_us, one.row.modelled_us) for one in judged if one.ratio is not None]
-    for (published_a, modelled_a), (published_b, modelled_b) in combinations(timed, 2):
-        assert published_a and published_b and modelled_a and modelled_b
+    timed = [(one.row.published_us or 0.0, one.ratio) for one in judged if one.ratio is not None]
+    for (published_a, ratio_a), (published_b, ratio_b) in combinations(timed, 2):
         printed = published_a / published_b
         if max(printed, 1 / printed) <= PRINTED_APART:
             continue
-        ours = modelled_a / modelled_b
+        ours = printed * ratio_a / ratio_b
         if (printed > 1) == (ours > 1) and max(ours, 1 / ours) > MODELLED_TIE:
             concordant += 1
         else:
