@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mpmbench.report.plots import INK, MUTED, RULE, SERIES, WIDTH, inline
@@ -51,13 +53,12 @@ def draw(chart: Scatter) -> str:
                 [p.x for p in chosen], [p.y for p in chosen], s=26, marker=MARKS[i % len(MARKS)], edgecolors=colour,
                 facecolors=colour if filled else "none", linewidths=1.1, label=name if filled else None,
             )  # fmt: skip
-        for point in points:
-            if point.label:
-                above = point.y > point.x
-                axes.annotate(
-                    point.label, (point.x, point.y), (0, 6 if above else -6), textcoords="offset points", fontsize=8,
-                    ha="right" if above else "left", va="bottom" if above else "top", color=INK,
-                )  # fmt: skip
+    for point, offset in _label_offsets([p for _, points in chart.series for p in points if p.label]):
+        above = point.y > point.x
+        axes.annotate(
+            point.label, (point.x, point.y), (0, offset if above else -offset), textcoords="offset points", fontsize=8,
+            ha="right" if above else "left", va="bottom" if above else "top", color=INK,
+        )  # fmt: skip
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xlim(low, high)
@@ -70,3 +71,18 @@ def draw(chart: Scatter) -> str:
     axes.set_ylabel(chart.axis)
     figure.legend(loc="lower center", ncols=len(chart.series), frameon=False, fontsize=9, handletextpad=0.2)
     return inline(figure, f"{chart.title}: {chart.axis} over {chart.x_axis}")
+
+
+def _label_offsets(points: Sequence[Point]) -> list[tuple[Point, int]]:
+    """Distance of each label from its mark [points]: further out where a neighbour's label stands already."""
+    placed: list[tuple[Point, int]] = []
+    for point in sorted(points, key=lambda p: abs(math.log(p.y / p.x))):
+        near = [
+            offset
+            for other, offset in placed
+            if abs(math.log10(other.x / point.x)) < 0.8
+            and abs(math.log10(other.y / point.y)) < 0.2
+            and (other.y > other.x) == (point.y > point.x)
+        ]
+        placed.append((point, max(near, default=-5) + 11))
+    return placed

@@ -22,6 +22,8 @@ STALLS = {
     "No Instr.": ("a wait for instructions", ("issue",)),
 }
 
+SECOND_COUNTS = 0.3  # of the modelled time: a shorter second term explains nothing
+
 
 @cache
 def known_causes(path: Path = PATH) -> Mapping[tuple[int, str], str]:
@@ -53,21 +55,16 @@ def ranked_terms(modelled: ModelledTime) -> list[str]:
 
 
 def _by_terms(modelled: ModelledTime, published_us: float, ratio: float) -> str:
-    bound = TERM_WORDS.get(modelled.bound, modelled.bound)
-    if modelled.low <= published_us * 1e-6 <= modelled.high:
-        inside = "; the printed time lies in the modelled range"
-    else:
-        inside = ""
     if ratio >= 1:
-        return f"Bound by {bound}, which would have to be {ratio:.2f} times as fast{inside}."
-    text = f"Bound by {bound}{inside}."
-    others = [term for term in ranked_terms(modelled) if term != modelled.bound]
-    if others and (second := modelled.terms[others[0]]) > 0:
-        together = (modelled.seconds + second) * 1e6 / published_us
-        share = second / modelled.terms.get(modelled.bound, modelled.seconds)
-        text += f" Next is {TERM_WORDS[others[0]]} at {100 * share:.0f} % of it"
-        text += f"; without overlap the two make {together:.2f} of the printed time." if share > 0.3 else "."
-    return text
+        text = f"What binds would have to be {ratio:.2f} times as fast."
+    else:
+        text = f"What binds would have to take {1 / ratio:.2f} times as long."
+        others = [term for term in ranked_terms(modelled) if term != modelled.bound]
+        if others and (second := modelled.terms[others[0]]) > SECOND_COUNTS * modelled.seconds:
+            together = (modelled.seconds + second) * 1e6 / published_us
+            text += f" Without overlap, it and {TERM_WORDS[others[0]]} make {together:.2f} of the printed time."
+    inside = modelled.low <= published_us * 1e-6 <= modelled.high
+    return f"{text} The printed time lies in the modelled range." if inside else text
 
 
 def _by_stall(printed: str, bound: str) -> str:

@@ -67,7 +67,18 @@ def newest(folder: Path = FOLDER) -> Frozen | None:
 def freeze(
     version: str, reason: str, gpu: str, constants: Constants, judged: Sequence[Judged], folder: Path = FOLDER
 ) -> tuple[Path, Frozen]:
-    """Write a new version. Raises InputError for one that exists, a name out of order, no reason, or a failed row."""
+    """Write a new version. Raises InputError for what ``check_new`` refuses, and for a row that failed."""
+    check_new(version, reason, folder)
+    if failed := [one.row for one in judged if one.row.failed]:
+        raise InputError(f"table {failed[0].table}, {failed[0].row} failed ({failed[0].failed}): mend it, then freeze")
+    frozen = Frozen(version, _now(), reason.strip(), note_name(version), gpu, dict(constants), _rows(judged))
+    path = folder / f"{version}.json"
+    _write(path, frozen)
+    return path, frozen
+
+
+def check_new(version: str, reason: str, folder: Path = FOLDER) -> None:
+    """Raises InputError for a version that exists or is out of order, and for a freeze without a reason."""
     if not reason.strip():
         raise InputError("a freeze needs its reason: --reason TEXT")
     if not re.fullmatch(r"v[1-9]\d*", version):
@@ -77,12 +88,6 @@ def freeze(
             f"version {version} cannot be written, {last.version} is frozen and versions are never changed: "
             f"take v{_number(last.version) + 1}"
         )
-    if failed := [one.row for one in judged if one.row.failed]:
-        raise InputError(f"table {failed[0].table}, {failed[0].row} failed ({failed[0].failed}): mend it, then freeze")
-    frozen = Frozen(version, _now(), reason.strip(), note_name(version), gpu, dict(constants), _rows(judged))
-    path = folder / f"{version}.json"
-    _write(path, frozen)
-    return path, frozen
 
 
 def record_score(judged: Sequence[Judged], differs: Sequence[str], folder: Path = FOLDER) -> Path:
@@ -135,6 +140,17 @@ def differences(frozen: Frozen | None, gpu: str, constants: Constants, judged: S
                 f"now {_us(here.modelled_us)}"
             )
     return found
+
+
+def stamp(frozen: Frozen | None, differs: Sequence[str]) -> dict[str, Any]:
+    """For the JSON file: against which version, and whether this run is post-hoc."""
+    version = None if frozen is None else frozen.version
+    return {
+        "version": version,
+        "post_hoc": bool(differs),
+        "stamp": "post-hoc" if differs else "",
+        "differs": [*differs],
+    }
 
 
 def note_name(version: str, folder: Path = DECISIONS) -> str:
