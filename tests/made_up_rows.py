@@ -25,10 +25,10 @@ def modelled(us: float, bound: str = "issue", **terms: float) -> ModelledTime:
     return ModelledTime("gtx970", seconds, 0.75 * seconds, 1.33 * seconds, bound, lengths)
 
 
-def row(table: int = 5, name: str = "AoS", published: float | None = 100, ours: float | None = 100, **more) -> Row:
-    """One row by its two times [us]."""
+def row(table: int = 5, name: str = "AoS", us: float | None = 100, ours: float | None = 100, **more) -> Row:
+    """One row by its published and its modelled time [us]."""
     time = None if ours is None else modelled(ours)
-    return replace(Row(table, name, 0, published, {}, None, time, {}, "hash", "print", None), **more)
+    return replace(Row(table, name, 0, us, {}, None, time, {}, "hash", "print", None), **more)
 
 
 def thesis_rows(factor: Callable[[int, str], float] = lambda table, name: 1.0) -> list[Row]:
@@ -57,4 +57,9 @@ def retime(rows: Sequence[Row], constants: Constants) -> list[Row]:
     """Times inverse to the first constant: enough to see a score move."""
     name = next(iter(CONSTANTS))
     factor = CONSTANTS[name].value / constants[name].value
-    return [replace(one, modelled=modelled(factor * (one.modelled_us or 0), one.modelled.bound)) for one in rows]
+    return [
+        replace(one, modelled=modelled(factor * 1e6 * one.modelled.seconds, one.modelled.bound))
+        if one.modelled
+        else one
+        for one in rows
+    ]

@@ -54,30 +54,30 @@ class Frozen:
     score: Mapping[str, Any] | None = None
 
 
-def versions(folder: Path = FOLDER) -> list[Frozen]:
+def versions(folder: Path | None = None) -> list[Frozen]:
     """Every version, oldest first."""
-    return [read(path) for path in sorted(folder.glob("v*.json"), key=lambda path: _number(path.stem))]
+    return [read(path) for path in sorted((folder or FOLDER).glob("v*.json"), key=lambda path: _number(path.stem))]
 
 
-def newest(folder: Path = FOLDER) -> Frozen | None:
+def newest(folder: Path | None = None) -> Frozen | None:
     found = versions(folder)
     return found[-1] if found else None
 
 
 def freeze(
-    version: str, reason: str, gpu: str, constants: Constants, judged: Sequence[Judged], folder: Path = FOLDER
+    version: str, reason: str, gpu: str, constants: Constants, judged: Sequence[Judged], folder: Path | None = None
 ) -> tuple[Path, Frozen]:
     """Write a new version. Raises InputError for what ``check_new`` refuses, and for a row that failed."""
     check_new(version, reason, folder)
     if failed := [one.row for one in judged if one.row.failed]:
         raise InputError(f"table {failed[0].table}, {failed[0].row} failed ({failed[0].failed}): mend it, then freeze")
     frozen = Frozen(version, _now(), reason.strip(), note_name(version), gpu, dict(constants), _rows(judged))
-    path = folder / f"{version}.json"
+    path = (folder or FOLDER) / f"{version}.json"
     _write(path, frozen)
     return path, frozen
 
 
-def check_new(version: str, reason: str, folder: Path = FOLDER) -> None:
+def check_new(version: str, reason: str, folder: Path | None = None) -> None:
     """Raises InputError for a version that exists or is out of order, and for a freeze without a reason."""
     if not reason.strip():
         raise InputError("a freeze needs its reason: --reason TEXT")
@@ -90,7 +90,7 @@ def check_new(version: str, reason: str, folder: Path = FOLDER) -> None:
         )
 
 
-def record_score(judged: Sequence[Judged], differs: Sequence[str], folder: Path = FOLDER) -> Path:
+def record_score(judged: Sequence[Judged], differs: Sequence[str], folder: Path | None = None) -> Path:
     """Put the first score into the newest version. Raises InputError if it has one, or this run is post-hoc."""
     frozen = newest(folder)
     if frozen is None:
@@ -102,7 +102,7 @@ def record_score(judged: Sequence[Judged], differs: Sequence[str], folder: Path 
     found = score(judged)
     if found.unmodelled:
         raise InputError(f"{found.unmodelled} comparable rows have no modelled time: mend them, then score")
-    path = folder / f"{frozen.version}.json"
+    path = (folder or FOLDER) / f"{frozen.version}.json"
     _write(path, replace(frozen, rows=_rows(judged, timed=True), score={"date": _now(), **score_json(found)}))
     return path
 
@@ -144,13 +144,9 @@ def differences(frozen: Frozen | None, gpu: str, constants: Constants, judged: S
 
 def stamp(frozen: Frozen | None, differs: Sequence[str]) -> dict[str, Any]:
     """For the JSON file: against which version, and whether this run is post-hoc."""
-    version = None if frozen is None else frozen.version
-    return {
-        "version": version,
-        "post_hoc": bool(differs),
-        "stamp": "post-hoc" if differs else "",
-        "differs": [*differs],
-    }
+    if frozen is None:
+        return {"version": None, "stamp": "not frozen", "differs": []}
+    return {"version": frozen.version, "stamp": "post-hoc" if differs else "as frozen", "differs": [*differs]}
 
 
 def note_name(version: str, folder: Path = DECISIONS) -> str:

@@ -35,6 +35,7 @@ from mpmbench.reproduce.sensitivity import STEP, Moved, tau
 from mpmbench.reproduce.targets import MEDIAN, Target
 from mpmbench.reproduce.thesis_tables import L2_RULE, TABLES, banks_section, errors_section, times_section
 
+NAMED = 5  # differences that are spelt out on top; the section on frozen versions has all
 FAMILIES = (("primitives", range(5, 11)), ("G2P", range(11, 13)), ("P2G", range(13, 17)))
 
 
@@ -78,7 +79,7 @@ def document(found: Reproduction) -> Document:
             "calibrated constants are not set anew.",
         ),
         Section("Constants of the model", (_constants(found.constants),)),
-        Section("Frozen versions and their scores", (_history(found.history),), intro=_history_intro(found)),
+        _history_section(found),
     ]
     return Document(
         title=f"The 2019 thesis reproduced: times modelled for the {found.gpu.title} against the published ones",
@@ -120,26 +121,23 @@ def _answer(found: Reproduction) -> list[str]:
 
 def _attention(found: Reproduction) -> list[Attention]:
     items = []
-    if found.differs:
-        if found.differs[0] == NOT_FROZEN:
-            text, action = (
-                "No version is frozen: this score is a rehearsal.",
-                "Freeze with `--freeze v1 --reason TEXT`.",
-            )
-        else:
-            version = found.history[-1].version
-            text = f"Post-hoc: {len(found.differs)} things differ from frozen version {version}: " + "; ".join(
-                found.differs[:8]
-            )
-            text += f"; and {len(found.differs) - 8} more." if len(found.differs) > 8 else "."
-            action = f"The score that counts for {version} is its first, below."
-        items.append(Attention("wrong", text, action))
+    if found.differs and found.differs[0] == NOT_FROZEN:
+        action = "Freeze with `--freeze v1 --reason TEXT`."
+        items.append(Attention("wrong", "No version is frozen: this score is a rehearsal.", action))
+    elif found.differs:
+        version = found.history[-1].version
+        named = "; ".join(found.differs[:NAMED])
+        more = f"; and {len(found.differs) - NAMED} more" if len(found.differs) > NAMED else ""
+        text = f"Post-hoc, this run is not the frozen version {version}: {named}{more}."
+        items.append(Attention("wrong", text, f"The score that counts for {version} is its first, below."))
     if failed := [one.row for one in found.judged if one.row.modelled is None]:
         names = "; ".join(f"table {row.table}, {row.row}: {row.failed or 'no reason given'}" for row in failed)
-        items.append(Attention("wrong", f"{len(failed)} rows have no modelled time: {names}.", "The score lacks them."))
-    if uncalibrated := [one for one in found.judged if one.row.modelled and not one.row.modelled.calibrated]:
-        reasons = "; ".join(dict.fromkeys(one.row.modelled.reason for one in uncalibrated if one.row.modelled))
-        items.append(Attention("warning", f"{len(uncalibrated)} rows are uncalibrated: {reasons}.", ""))
+        items.append(Attention("wrong", f"Without a modelled time: {names}.", "The score lacks them."))
+    if uncalibrated := [one.row for one in found.judged if one.row.modelled and not one.row.modelled.calibrated]:
+        names = "; ".join(
+            f"table {row.table}, {row.row}: {row.modelled.reason}" for row in uncalibrated if row.modelled
+        )
+        items.append(Attention("warning", f"Uncalibrated: {names}.", ""))
     return items
 
 
@@ -340,11 +338,16 @@ def _history(history: Sequence[Frozen]) -> Table:
     return Table("", columns, tuple(rows))
 
 
-def _history_intro(found: Reproduction) -> str:
-    text = "A version fixes constants, kernels, datasets and the list of scored rows; its first score stays."
+def _history_section(found: Reproduction) -> Section:
+    intro = "A version fixes constants, kernels, datasets and the list of scored rows; its first score stays."
+    tables = [_history(found.history)]
     if found.differs:
-        return text + f" This run is {'a rehearsal' if found.differs[0] == NOT_FROZEN else 'post-hoc'}."
-    return text + f" This run is {found.history[-1].version}, as frozen."
+        columns = (Column("what differs in this run", Kind.NAME, Quantity.TEXT),)
+        rows = tuple(Row(cells(columns, (line,))) for line in found.differs)
+        tables.append(Table("Post-hoc" if found.history else "A rehearsal", columns, rows))
+    elif found.history:
+        intro += f" This run is {found.history[-1].version}, as frozen."
+    return Section("Frozen versions and their scores", tuple(tables), intro=intro)
 
 
 def _legend(sections: Sequence[Section]) -> tuple[tuple[str, str, str], ...]:
