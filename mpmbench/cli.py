@@ -1,4 +1,4 @@
-"""The command line: ``mpmbench list | run | check | report | verify | selftest | doctor | env``.
+"""The command line: ``mpmbench list | run | check | report | verify | reproduce | selftest | doctor | env``.
 
 Names and axis syntax follow NVBench. Exit codes: 0 ok, 1 harness error, 2 usage or bad input, 3 regression, 4 wrong
 results or findings, 130 interrupted.
@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table as RichTable
 
+from mpmbench.cli_reproduce import reproduce
 from mpmbench.errors import InputError, MpmbenchError
 
 console = Console(stderr=False, highlight=False)
@@ -456,6 +457,9 @@ def env() -> None:
     for name, value in asdict(Environment.capture(argv=[])).items():
         if value not in (None, (), {}):
             click.echo(f"{name}: {value}")
+
+
+main.add_command(reproduce)
 
 
 # --- running ----------------------------------------------------------------------------------------------------------

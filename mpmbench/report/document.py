@@ -15,6 +15,7 @@ from mpmbench.report import banks, primitives
 from mpmbench.report import table as tables
 from mpmbench.report.banks import BankPicture
 from mpmbench.report.plots import Bars, Line, Lines, logspace, thin
+from mpmbench.report.scatter import Scatter
 from mpmbench.report.table import Group, Kind, Table
 from mpmbench.report.text import number, seconds_text
 
@@ -52,7 +53,7 @@ class Details:
 class Section:
     title: str
     tables: tuple[Table, ...] = ()
-    charts: tuple[Bars | Lines | BankPicture, ...] = ()
+    charts: tuple[Bars | Lines | BankPicture | Scatter, ...] = ()
     details: tuple[Details, ...] = ()
     intro: str = ""
 

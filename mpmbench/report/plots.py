@@ -17,6 +17,7 @@ from mpmbench.report.text import number
 
 if TYPE_CHECKING:
     from mpmbench.report.banks import BankPicture
+    from mpmbench.report.scatter import Scatter
 
 INK = "#010101"
 RULE = "#020202"
@@ -60,7 +61,7 @@ class Lines:
 
 
 @lru_cache(maxsize=256)
-def svg(chart: Bars | Lines | BankPicture) -> str:
+def svg(chart: Bars | Lines | BankPicture | Scatter) -> str:
     """An ``<svg>`` element. Kept, as a page that comes out too large is laid out again with less on it."""
     import matplotlib
 
@@ -84,9 +85,9 @@ def svg(chart: Bars | Lines | BankPicture) -> str:
             return _bars(chart)
         if isinstance(chart, Lines):
             return _lines(chart)
-        from mpmbench.report.banks import draw
+        from mpmbench.report import banks, scatter
 
-        return draw(chart)
+        return scatter.draw(chart) if isinstance(chart, scatter.Scatter) else banks.draw(chart)
 
 
 def _bars(chart: Bars) -> str:
