@@ -1,4 +1,4 @@
-"""The command line: ``mpmbench list | run | check | report | verify | reproduce | selftest | doctor | env``.
+"""The command line: ``mpmbench list | run | check | profile | report | verify | reproduce | selftest | doctor | env``.
 
 Names and axis syntax follow NVBench. Exit codes: 0 ok, 1 harness error, 2 usage or bad input, 3 regression, 4 wrong
 results or findings, 130 interrupted.
@@ -605,6 +605,8 @@ def _summarise(records: list[Any], written: Sequence[Path]) -> None:
     if any(record.status == "broken" for record in records):
         sys.exit(1)
 
+
+from mpmbench import cli_profile  # noqa: E402, F401  # adds its command to main; it needs what stands above
 
 if __name__ == "__main__":
     main()

@@ -24,6 +24,7 @@ import numpy as np
 from mpmbench.environment import Environment
 from mpmbench.errors import InputError
 from mpmbench.grid import Grid
+from mpmbench.profile_record import Profile, from_plain, to_plain
 from mpmbench.simt.counters import Counters, Finding, SourceLine, Tally
 
 if TYPE_CHECKING:
@@ -169,7 +170,7 @@ class Record:
     transfer_counters: Counters | None = None
     transfer_measurement: Measurement | None = None
     finish: Mapping[str, StepCost] = field(default_factory=dict)  # steps after the transfer (order restored, ...)
-    modelled: Mapping[str, Any] | None = None  # by a performance model, with the GPU it names
+    modelled: Mapping[str, Profile] | None = None  # by the performance model, for each GPU by name
     line_texts: Mapping[SourceLine, str] = field(default_factory=dict)  # of the lines in transfer_counters
     floor_bytes: int | None = None  # compulsory global traffic: each particle and touched node once
     device_bytes_predicted: int | None = None
@@ -190,6 +191,10 @@ class Record:
         counted = [s for s in self.steps.values() if s.counters] or self.transfer_counters
         if counted and self.device != "simulated":
             raise ValueError(f"counters come from the simulated device, not from {self.device}")
+        if self.modelled and (not self.simulated or self.check is None or not self.check.passed):
+            raise ValueError("a modelled time needs counters of a simulated run whose check passed")
+        if any(gpu != profile.gpu for gpu, profile in (self.modelled or {}).items()):
+            raise ValueError("a profile stands under the name of another GPU")
         if self.preprocess.keys() & self.finish.keys():
             raise ValueError("a step before the transfer and one after it share a name")
         if self.skipped_because and (timed or counted or self.check):
@@ -263,6 +268,8 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Counters):
         lines = [[line.file, line.line, _plain(tally)] for line, tally in value.lines.items()]
         return {"total": _plain(value.total), "lines": lines}
+    if isinstance(value, Profile):
+        return _plain(to_plain(value))
     if is_dataclass(value) and not isinstance(value, type):
         return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
     if isinstance(value, Mapping):
@@ -312,6 +319,7 @@ def from_json(line: str) -> Record:
         "finish": {name: _step(step) for name, step in d["finish"].items()},
         "transfer_counters": _counters(d["transfer_counters"]),
         "transfer_measurement": _measurement(d["transfer_measurement"]),
+        "modelled": _modelled(d["modelled"]),
         "line_texts": {SourceLine(file, number): text for file, number, text in d["line_texts"]},
         "findings": tuple(_finding(f) for f in d["findings"]),
     })  # fmt: skip
@@ -346,6 +354,10 @@ def _measurement(d: dict[str, Any] | None) -> Measurement | None:
 
 def _step(d: dict[str, Any]) -> StepCost:
     return StepCost(_counters(d["counters"]), _measurement(d["measurement"]))
+
+
+def _modelled(d: dict[str, Any] | None) -> dict[str, Profile] | None:
+    return None if d is None else {gpu: from_plain(profile) for gpu, profile in d.items()}
 
 
 def _finding(d: dict[str, Any]) -> Finding:
@@ -496,7 +508,8 @@ def load_records(paths: str | Path | Sequence[str | Path]) -> pd.DataFrame:
     """Records of one or more JSON-lines files as a pandas DataFrame: one row per record, flat columns.
 
     Columns are prefixed by what they hold: ``axis_``, ``check_``, ``transfer_``, ``preprocess_`` (all its
-    steps together), ``step_<name>_``, ``environment_``. Counters end in the counter's name, times in ``_s``.
+    steps together), ``step_<name>_``, ``modelled_<gpu>_``, ``environment_``. Counters end in
+    the counter's name, times in ``_s``.
     """
     import pandas as pd
 
@@ -526,6 +539,10 @@ def flatten(record: Record) -> dict[str, Any]:
     row |= _flat_cost("preprocess", total_cost(record.preprocess.values()))
     for name, step in record.steps.items():
         row |= _flat_cost(f"step_{name}", step)
+    for gpu, profile in (record.modelled or {}).items():
+        time = profile.time
+        shown = {"s": time.seconds, "low_s": time.low, "high_s": time.high, "bound": time.bound}
+        row |= {f"modelled_{gpu}_{name}": value for name, value in shown.items()}
     row |= {
         "device_bytes_predicted": record.device_bytes_predicted,
         "findings": len(record.findings),

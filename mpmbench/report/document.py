@@ -11,10 +11,12 @@ from dataclasses import asdict, dataclass, field, replace
 from mpmbench.errors import InputError
 from mpmbench.measure import SHORTEST_RANKED, too_fast_to_rank
 from mpmbench.record import Record
-from mpmbench.report import banks, primitives
+from mpmbench.report import banks, modelled, primitives, profile
 from mpmbench.report import table as tables
 from mpmbench.report.banks import BankPicture
+from mpmbench.report.modelled import GpuGroup
 from mpmbench.report.plots import Bars, Line, Lines, logspace, thin
+from mpmbench.report.profile import Card
 from mpmbench.report.scatter import Scatter
 from mpmbench.report.table import Group, Kind, Table
 from mpmbench.report.text import number, seconds_text
@@ -27,7 +29,7 @@ KINDS = {
     Kind.PREDICTED: "follows from sizes or from the compiler, known before anything runs",
     Kind.SIMULATED: "counted exactly while the CUDA kernel ran on the simulated device; not time",
     Kind.MEASURED: "event time on a GPU",
-    Kind.MODELLED: "performance model of a named GPU",
+    Kind.MODELLED: "performance model of a named GPU, its caches and DRAM included; never measured",
     Kind.PUBLISHED: "printed in the source named, on its GPU",
 }
 
@@ -56,6 +58,7 @@ class Section:
     charts: tuple[Bars | Lines | BankPicture | Scatter, ...] = ()
     details: tuple[Details, ...] = ()
     intro: str = ""
+    cards: tuple[Card, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,8 @@ class Extent:
     """How much a document holds.
 
     charts: how many groups get them; drawing takes time.  rows: of a table, the best ones.  groups: how many get a
-    section, in the order run; the summary still has all.
+    section, in the order run; the summary still has all.  cards: how many strategies get a profile of their own, of
+    all GPUs together; the tables still have all.
     """
 
     hottest: bool = True
@@ -84,17 +88,18 @@ class Extent:
     charts: int = 24
     rows: int | None = None
     groups: int | None = None
+    cards: int = 24
 
 
 # From everything to what always fits.
 EXTENTS = (
     Extent(),
     Extent(hottest=False),
-    Extent(hottest=False, steps=False),
-    Extent(hottest=False, steps=False, charts=0),
-    Extent(hottest=False, steps=False, charts=0, rows=200, groups=100),
-    Extent(hottest=False, steps=False, charts=0, rows=40, groups=40),
-    Extent(hottest=False, steps=False, charts=0, rows=10, groups=10),
+    Extent(hottest=False, steps=False, cards=12),
+    Extent(hottest=False, steps=False, charts=0, cards=6),
+    Extent(hottest=False, steps=False, charts=0, rows=200, groups=100, cards=0),
+    Extent(hottest=False, steps=False, charts=0, rows=40, groups=40, cards=0),
+    Extent(hottest=False, steps=False, charts=0, rows=10, groups=10, cards=0),
 )
 
 
@@ -105,7 +110,13 @@ def build(records: Sequence[Record], extent: Extent = EXTENTS[0]) -> Document:
     records = list(records)
     transfers = [record for record in records if record.is_transfer]
     groups = tables.group(transfers)
-    sections = [Section("Answer in one table", tuple(tables.summary(groups)))] if any(g.ranked for g in groups) else []
+    on_gpus = modelled.gpu_groups(records)
+    on_gpus_transfers = [g for g in on_gpus if g.group.first.is_transfer][: extent.groups]
+    sections = [_on_my_gpu(on_gpus_transfers)] if on_gpus_transfers else []
+    profiles = _profiles(on_gpus[: extent.groups], extent)
+    sections += profiles
+    if any(g.ranked for g in groups):
+        sections.append(Section("Answer in one table", tuple(tables.summary(groups))))
     if published := tables.presets(records):
         sections.append(Section("Published tables, and the same rows here", tuple(published)))
     several_devices = len({g.device for g in groups}) > 1
@@ -136,12 +147,15 @@ def build(records: Sequence[Record], extent: Extent = EXTENTS[0]) -> Document:
         left_out.append(f"charts of {_plural(len(groups) - extent.charts, 'section')}")
     if extent.groups is not None and len(groups) > extent.groups:
         left_out.append(_plural(len(groups) - extent.groups, "section"))
+    plain = sum(len(g.runs) for g in on_gpus) - sum(card.detailed for s in profiles for card in s.cards)
+    if plain:
+        left_out.append(f"charts and lines of {_plural(plain, 'profile')}")
     verdict, agreed = _verdict(records)
     return Document(
         title="mpmbench report",
         verdict=verdict,
         agreed=agreed,
-        answer=tuple(_answer(groups, any(record.transfer_measurement for record in records))),
+        answer=tuple(_answer(groups, on_gpus, any(record.transfer_measurement for record in records))),
         attention=tuple(_attention(records, groups)),
         sections=tuple(sections),
         legend=_legend(sections),
@@ -197,10 +211,16 @@ def _plural(count: int, one: str, many: str = "") -> str:
     return f"{count:,} {one if count == 1 else many or one + 's'}"
 
 
-def _answer(groups: Sequence[Group], measured: bool) -> list[str]:
+def _answer(groups: Sequence[Group], on_gpus: Sequence[GpuGroup], measured: bool) -> list[str]:
     sentences = []
     timed = [g for g in groups if not g.simulated and g.ranked]
-    if not measured:
+    transfers = [g for g in on_gpus if g.group.first.is_transfer]
+    if not measured and on_gpus:
+        sentences.append(
+            "No GPU took part: costs are counted on a simulated device, and every time below is modelled for the GPU "
+            "that it names, with a range."
+        )
+    elif not measured:
         sentences.append(
             "No GPU took part: every cost below is counted on a simulated device, exactly, and is not time. "
             "Run the same command where there is a GPU for times and speedups."
@@ -218,6 +238,9 @@ def _answer(groups: Sequence[Group], measured: bool) -> list[str]:
         sentences.append(f"{words}.")
     if len(timed) > NAMED:
         sentences.append(f"The table below has {_plural(len(timed) - NAMED, 'more measured case')}.")
+    sentences += [modelled.answer(g) for g in transfers[:NAMED]]
+    if len(transfers) > NAMED:
+        sentences.append(f"The table below has {_plural(len(transfers) - NAMED, 'more modelled case')}.")
     for transfer in ("p2g", "g2p"):
         counted = [g for g in groups if g.simulated and g.ranked and g.first.transfer == transfer]
         for name, counter in (("sectors", tables.sectors), ("warp instructions", tables.warp_inst)):
@@ -291,6 +314,37 @@ def _where(places: list[str]) -> str:
         return "."
     more = f"; and {len(named) - NAMED} more" if len(named) > NAMED else ""
     return f": {'; '.join(named[:NAMED])}{more}."
+
+
+# ---- modelled ----------------------------------------------------------------------------------------------
+
+RANKINGS_IN_SIGHT = 2  # more of them are folded away
+
+
+def _on_my_gpu(groups: Sequence[GpuGroup]) -> Section:
+    """Who wins on which GPU, and every ranking."""
+    rankings = [modelled.ranking(g) for g in groups]
+    in_sight = len(rankings) <= RANKINGS_IN_SIGHT
+    problems = list(dict.fromkeys(g.problem for g in groups))
+    return Section(
+        title="What would it do on my GPU?",
+        tables=(modelled.winners_table(groups), *(rankings if in_sight else ())),
+        details=() if in_sight else tuple(Details(t.title, (_untitled(t),)) for t in rankings),
+        intro=(f"{problems[0]}. " if len(problems) == 1 else "") + modelled.EXPLANATION,
+    )
+
+
+def _profiles(groups: Sequence[GpuGroup], extent: Extent) -> list[Section]:
+    """What binds each strategy on each GPU. Charts go to the fastest of every group alike."""
+    each, more = divmod(extent.cards, len(groups)) if groups else (0, 0)
+    sections = []
+    for i, g in enumerate(groups):
+        charted = each + (i < more)
+        cards = tuple(profile.card(g, r, detailed=place < charted) for place, r in enumerate(g.runs[: extent.rows]))
+        shown = tuple(table for table in (profile.overview(g), profile.metrics(g), profile.traffic(g)) if table)
+        intro = f"{g.problem}. {profile.EXPLANATION.format(gpu=g.gpu_title)}"
+        sections.append(Section(f"Profile: {g.title}", shown, intro=intro, cards=cards))
+    return sections
 
 
 # ---- groups ------------------------------------------------------------------------------------------------
@@ -378,7 +432,9 @@ def _break_even_lines(g: Group) -> list[Bars | Lines]:
 
 
 def _legend(sections: Sequence[Section]) -> tuple[tuple[str, str, str], ...]:
-    shown = [t for s in sections for t in (*s.tables, *(t for d in s.details for t in d.tables))]
+    shown = [t for s in sections for t in s.tables]
+    shown += [t for s in sections for d in s.details for t in d.tables]
+    shown += [t for s in sections for c in s.cards for t in c.tables]
     columns = {
         (c.title, "" if c.kind is Kind.NAME else str(c.kind), c.explain): None
         for t in shown

@@ -13,6 +13,7 @@ from mpmbench.report.banks import BankPicture
 from mpmbench.report.document import KINDS, Document
 from mpmbench.report.plots import Bars, Lines, svg
 from mpmbench.report.scatter import Scatter
+from mpmbench.report.speed_of_light import Roofline, SpeedOfLight
 from mpmbench.report.table import Column, Kind, Quantity, Table
 from mpmbench.report.text import LEFT, format_value
 
@@ -40,7 +41,7 @@ def anchor(title: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
 
-def _chart(chart: Bars | Lines | BankPicture | Scatter) -> Markup:
+def _chart(chart: Bars | Lines | BankPicture | Scatter | SpeedOfLight | Roofline) -> Markup:
     return Markup(svg(chart))
 
 
@@ -76,7 +77,7 @@ def _rows(table: Table) -> list[dict[str, Any]]:
         for c, (cell, column) in enumerate(zip(row.cells, table.columns, strict=True)):
             text = format_value(cell.value, column.quantity)
             if column.under:
-                cells[-1]["under"] = text
+                cells[-1]["under"] = "" if cell.value is None else text
                 continue
             cells.append(
                 {

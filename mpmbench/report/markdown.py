@@ -41,6 +41,12 @@ def _section(section: Section) -> list[str]:
         for table in details.tables:
             parts += _table(table)
         parts.append("</details>")
+    for card in section.cards:
+        parts.append(f"#### {code(card.title)}")
+        badge = f"**Uncalibrated:** {escape(card.badge)}." if card.badge else ""
+        parts.append(" ".join(filter(None, [f"{escape(card.headline)}.", badge, escape(card.sentence)])))
+        for table in card.tables:
+            parts += _table(table)
     return parts
 
 

@@ -18,6 +18,7 @@ from mpmbench.report.text import number
 if TYPE_CHECKING:
     from mpmbench.report.banks import BankPicture
     from mpmbench.report.scatter import Scatter
+    from mpmbench.report.speed_of_light import Roofline, SpeedOfLight
 
 INK = "#010101"
 RULE = "#020202"
@@ -61,7 +62,7 @@ class Lines:
 
 
 @lru_cache(maxsize=256)
-def svg(chart: Bars | Lines | BankPicture | Scatter) -> str:
+def svg(chart: Bars | Lines | BankPicture | Scatter | SpeedOfLight | Roofline) -> str:
     """An ``<svg>`` element. Kept, as a page that comes out too large is laid out again with less on it."""
     import matplotlib
 
@@ -85,9 +86,13 @@ def svg(chart: Bars | Lines | BankPicture | Scatter) -> str:
             return _bars(chart)
         if isinstance(chart, Lines):
             return _lines(chart)
-        from mpmbench.report import banks, scatter
+        from mpmbench.report import banks, scatter, speed_of_light
 
-        return scatter.draw(chart) if isinstance(chart, scatter.Scatter) else banks.draw(chart)
+        if isinstance(chart, banks.BankPicture):
+            return banks.draw(chart)
+        if isinstance(chart, scatter.Scatter):
+            return scatter.draw(chart)
+        return speed_of_light.draw(chart)
 
 
 def _bars(chart: Bars) -> str:

@@ -55,10 +55,12 @@ class Quantity(StrEnum):
     NUMBER = "number"
     BYTES = "bytes"
     SECONDS = "seconds"
+    SECONDS_RANGE = "seconds range"  # a pair (low, high)
     FACTOR = "factor"  # 2.0 is printed as a multiple
     SHARE = "share"  # 0.5 is printed as a percentage
     RANK = "rank"
     TRANSFERS = "transfers"  # a break-even: 1 is "at once", infinity is "never"
+    TRANSFERS_RANGE = "transfers range"
 
 
 @dataclass(frozen=True)

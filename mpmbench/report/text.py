@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 from mpmbench.report.table import Quantity
@@ -28,6 +29,10 @@ def format_value(value: Any, quantity: Quantity) -> str:
             return bytes_text(value)
         case Quantity.SECONDS:
             return seconds_text(value)
+        case Quantity.SECONDS_RANGE:
+            return range_text(value[0], value[1], seconds_text)
+        case Quantity.TRANSFERS_RANGE:
+            return range_text(value[0], value[1], transfers_text)
         case Quantity.RATE:
             return scaled(value, 1000, ("", " k", " M", " G", " T"))
         case Quantity.FACTOR:
@@ -74,6 +79,15 @@ def bytes_text(value: float) -> str:
 
 def seconds_text(value: float) -> str:
     return scaled(value * 1e9, 1000, (" ns", " µs", " ms", " s"))
+
+
+def range_text(low: float, high: float, words: Callable[[float], str]) -> str:
+    """Both ends, once where they read the same; their unit once where they share it."""
+    first, last = words(low), words(high)
+    if first == last:
+        return first
+    (value, *unit), (_, *other) = first.split(), last.split()
+    return f"{value} to {last}" if unit == other else f"{first} to {last}"
 
 
 def transfers_text(value: float) -> str:
