@@ -1,15 +1,158 @@
-"""Cases on named GPUs: one simulation per architecture, its caches and DRAM counted, its time modelled."""
+"""Cases on named GPUs: run on the simulated device with that GPU's caches and DRAM, checked, counted, time modelled."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
-from mpmbench.errors import InputError
+from mpmbench.device import LaunchProfile, LaunchReport
+from mpmbench.device.simulated import SimulatedDevice
+from mpmbench.environment import Environment
 from mpmbench.gpu import Gpu
+from mpmbench.gpu.machine import machine_for
+from mpmbench.gpu.model import Rates, metrics_of, model_launches, rates_of
+from mpmbench.gpu.modelled import ModelledTime
+from mpmbench.gpu.occupancy import occupancy
+from mpmbench.primitive_runs import PrimitiveCase
+from mpmbench.profile_record import LineProfile, Profile, Residency
 from mpmbench.record import Record
+from mpmbench.runner import Inputs, refuse_bad_input, run_case
+from mpmbench.simt.counters import SourceLine, Tally
+from mpmbench.simt.machine import MemoryTally
+
+# By what a source line's share of a term is measured.
+_SHARE_OF: Mapping[str, Callable[[Tally, MemoryTally], int]] = {
+    "issue": lambda tally, memory: tally.warp_inst,
+    "latency": lambda tally, memory: tally.warp_inst,
+    "shared": lambda tally, memory: tally.shm_wavefronts + 3 * tally.satom_iter,
+    "l1": lambda tally, memory: memory.l1_request_bytes,
+    "l2": lambda tally, memory: memory.l2_sectors,
+    "dram": lambda tally, memory: memory.dram_sectors,
+    "activations": lambda tally, memory: memory.dram_activations,
+    "atomics": lambda tally, memory: memory.atomic_lanes,
+}
+
+
+@dataclass(frozen=True)
+class Modeller:
+    """What the runner asks for a GPU's view of what just ran. seen: the transfer launches of the last case."""
+
+    gpu: Gpu
+    seen: list[LaunchProfile] = field(default_factory=list)
+
+    @cached_property
+    def rates(self) -> Rates:
+        return rates_of(self.gpu)
+
+    def device(self) -> SimulatedDevice:
+        """A simulated device with this GPU's memory system."""
+        return SimulatedDevice(arch=self.gpu.arch, mode="profile", machine=machine_for(self.gpu))
+
+    def __call__(
+        self, before: Mapping[str, LaunchReport], transfer: LaunchReport, after: Mapping[str, LaunchReport]
+    ) -> dict[str, Profile]:
+        """Reports of the steps before, of the transfer and of the steps after -> a record's ``modelled``."""
+        self.seen[:] = transfer.profiles
+        steps = {
+            name: model_launches(self.gpu, report.profiles, self.rates)
+            for name, report in {**before, **after}.items()
+            if report.profiles
+        }
+        return {self.gpu.name: profile_of(self.gpu, self.rates, transfer.profiles, steps)}
+
+
+def profile_of(
+    gpu: Gpu, rates: Rates, launches: Sequence[LaunchProfile], steps: Mapping[str, ModelledTime] | None = None
+) -> Profile:
+    """The launches of a transfer, as a record keeps them. steps: times of the others by name."""
+    time = model_launches(gpu, launches, rates)
+    memory = MemoryTally()
+    for launch in launches:
+        memory = memory + launch.memory.total
+    clock = gpu["clock_mhz"] * 1e6
+    held = residency(gpu, launches)
+    return Profile(
+        gpu=gpu.name,
+        title=gpu.title,
+        time=time,
+        occupancy=held,
+        memory=memory,
+        steps=dict(steps or {}),
+        hot_address=max((launch.memory.hot_address for launch in launches), default=0),
+        latency_cycles=sum(launch.memory.latency_cycles for launch in launches),
+        warp_cycles=sum(launch.memory.warp_cycles for launch in launches),
+        barrier_wait_cycles=sum(launch.memory.barrier_wait_cycles for launch in launches),
+        metrics={**metrics_of(gpu, launches, time), "sm_occupancy_warps": occupancy_warps(gpu, launches)},
+        lines=_lines(launches, time.bound),
+        peak={
+            "warp_inst": gpu["sm_count"] * gpu["schedulers_per_sm"] * clock,
+            "l1_bytes": gpu["sm_count"] * gpu["l1_bytes_per_clk"] * clock,
+            "l2_bytes": gpu["l2_bandwidth"],
+            "dram_bytes": gpu["dram_bandwidth"],
+        },
+    )
+
+
+def residency(gpu: Gpu, launches: Sequence[LaunchProfile]) -> Residency:
+    """Of the launch with most thread blocks."""
+    most = int(gpu["warps_per_sm"])
+    if not launches:
+        return Residency(0, 0, "blocks", most)
+    launch = max(launches, key=lambda one: one.blocks)
+    held = occupancy(gpu, launch.threads, launch.info.registers or 0, launch.shared_bytes)
+    return Residency(held.warps, held.blocks, held.limiter, most)
+
+
+def occupancy_warps(gpu: Gpu, launches: Sequence[LaunchProfile]) -> float:
+    """Resident warps per SM, mean over the SMs and the modelled life of the launches."""
+    cycles = sum(launch.memory.latency_cycles for launch in launches)
+    return sum(launch.memory.warp_cycles for launch in launches) / (gpu["sm_count"] * cycles) if cycles else 0.0
+
+
+def _lines(launches: Sequence[LaunchProfile], bound: str) -> dict[SourceLine, LineProfile]:
+    tallies: dict[SourceLine, tuple[Tally, MemoryTally]] = {}
+    for launch in launches:
+        for line in {**launch.counters.lines, **launch.memory.lines}:
+            tally, memory = tallies.get(line, (Tally(), MemoryTally()))
+            tallies[line] = (
+                tally + launch.counters.lines.get(line, Tally()),
+                memory + launch.memory.lines.get(line, MemoryTally()),
+            )
+    amounts = {line: _SHARE_OF[bound](*found) for line, found in tallies.items()}
+    total = sum(amounts.values()) or 1
+    return {
+        line: LineProfile(tally.warp_inst, memory.dram_sectors, memory.l2_sectors, amounts[line] / total)
+        for line, (tally, memory) in tallies.items()
+    }
 
 
 def profile_cases(cases: Sequence[Any], gpus: Sequence[Gpu], progress: Callable[[str, int, int], None]) -> list[Record]:
-    """Records with ``modelled`` filled for each GPU. progress: told what runs, the cases done and the cases in all."""
-    raise InputError("profile is not implemented")
+    """Records with ``modelled`` filled for each GPU, one per case and architecture: GPUs of one architecture run the
+    same code and share a record. progress: told what runs, the cases done and the cases in all."""
+    refuse_bad_input(case for case in cases if not isinstance(case, PrimitiveCase))
+    environment = Environment.capture()
+    inputs = Inputs()
+    records: list[Record] = []
+    done, total = 0, len(cases) * len(gpus)
+    for case in cases:
+        by_arch: dict[str, Record] = {}
+        for gpu in gpus:
+            progress(f"{gpu.name} {case.title}", done, total)
+            record = run_modelled(case, Modeller(gpu), inputs, environment)
+            known = by_arch.get(gpu.arch)
+            if known is not None and known.modelled and record.modelled:
+                record = replace(known, modelled={**known.modelled, **record.modelled})
+            by_arch[gpu.arch] = record if known is None or record.modelled else known
+            done += 1
+        records += by_arch.values()
+    progress("done", total, total)
+    return records
+
+
+def run_modelled(case: Any, model: Modeller, inputs: Inputs, environment: Environment) -> Record:
+    """Run, check, count and model one case."""
+    if isinstance(case, PrimitiveCase):
+        return case.run(model.device(), environment, model=model)
+    return run_case(case, model.device(), inputs, environment, model=model)

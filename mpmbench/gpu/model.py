@@ -12,24 +12,27 @@ latency bound after Volkov (2016). With counts per launch, N SMs that have work,
     atomics      the larger of lanes / their rate, and atomics on one word at one per cycle
     latency      end of the last warp if nothing but latencies and barriers took time
 
-The time is the launch overhead plus the largest term. Its range: from 1/1.25 of the term to 1.25 times it or, where that
-is more, to the two largest terms one after the other, as if they did not overlap at all.
+The time is the launch overhead plus the largest term. Its range: from 1/1.25 of the term to 1.25 times it or, where
+that is more, to the two largest terms one after the other, as if they did not overlap at all.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 from mpmbench.device import LaunchProfile
-from mpmbench.gpu import Gpu
+from mpmbench.gpu import Gpu, get_gpu
+from mpmbench.gpu.machine import cas_trip_slots, slot_cycles
 from mpmbench.gpu.modelled import TERMS, ModelledTime
-from mpmbench.gpu.sass import CAS_TRIP, is_shared_float_add, weight
+from mpmbench.gpu.sass import is_shared_float_add, weight
 
 SECTOR_BYTES = 32
 ERROR = 1.25  # what models of this kind reach on codes that they were not made for: 15 to 25 %
 ATOMIC_RANGE = (0.5, 4.0)  # of one addition per cycle and L2 slice, where no rate is known
 ACTIVATION_RANGE = (0.5, 2.0)  # of the calibrated rate per bank, where no rate is known
+CALIBRATED_GPU = "gtx970"
 CAS_WAVEFRONTS = 3  # a round loads (1) and swaps (2)
 
 
@@ -48,23 +51,26 @@ class Rates:
     uncalibrated: str = ""
 
 
-def rates_of(gpu: Gpu, activations_per_bank: float) -> Rates:
-    """The rates of a GPU's description, and guesses for those that it lacks.
-
-    activations_per_bank: [1/s] of the calibrated GPU; banks of other GPUs are taken to be as fast.
-    """
+def rates_of(gpu: Gpu) -> Rates:
+    """The rates of a GPU's description, and guesses for those that it lacks: one addition per cycle and L2 slice, and
+    banks as fast as those of the calibrated GPU."""
     atomics, activations = gpu.get("atomic_word_rate"), gpu.get("row_activation_rate")
-    banks = gpu["dram_channels"] * gpu["dram_banks"]
     slices = gpu.get("l2_slices") or gpu["l2_bandwidth"] / (SECTOR_BYTES * gpu["clock_mhz"] * 1e6)
     missing = [name for name, rate in (("atomics", atomics), ("scattered DRAM access", activations)) if rate is None]
     return Rates(
         gpu.get("dram_bandwidth_achieved") or 0.8 * gpu["dram_bandwidth"],
         atomics or slices * gpu["clock_mhz"] * 1e6,
-        activations or activations_per_bank * banks,
+        activations or _activations_per_bank() * gpu["dram_channels"] * gpu["dram_banks"],
         (1.0, 1.0) if atomics else ATOMIC_RANGE,
         (1.0, 1.0) if activations else ACTIVATION_RANGE,
         f"the rate of {' and of '.join(missing)} is not known for this GPU" if missing else "",
     )
+
+
+@cache
+def _activations_per_bank() -> float:
+    gpu = get_gpu(CALIBRATED_GPU)
+    return (gpu.get("row_activation_rate") or 0.0) / (gpu["dram_channels"] * gpu["dram_banks"])
 
 
 def busy_sms(gpu: Gpu, blocks: int) -> float:
@@ -85,13 +91,8 @@ def issue_slots(gpu: Gpu, launch: LaunchProfile) -> float:
             float_satomics += times * is_shared_float_add(opcode)
     if satomics:
         trips = launch.counters.total.satom_iter * float_satomics / satomics
-        slots += trips * sum(count * slot_cycles(gpu, kind) for kind, count in CAS_TRIP.items())
+        slots += trips * cas_trip_slots(gpu)
     return slots
-
-
-def slot_cycles(gpu: Gpu, kind: str) -> float:
-    """Cycles of an SM that one machine instruction of a class takes."""
-    return 1 / min(gpu["schedulers_per_sm"], gpu.get(f"rate_{kind}") or gpu["schedulers_per_sm"])
 
 
 def terms_of(gpu: Gpu, launch: LaunchProfile, rates: Rates) -> dict[str, float]:
@@ -116,7 +117,7 @@ def model_launch(gpu: Gpu, launch: LaunchProfile, rates: Rates) -> ModelledTime:
     """Predicted time of one launch."""
     terms, overhead = terms_of(gpu, launch, rates), gpu["launch_overhead"]
     bound = max(TERMS, key=lambda name: terms[name])
-    first, second = sorted(terms.values(), reverse=True)[:2]
+    first = terms[bound]
     fast = terms_of(gpu, launch, _scaled(rates, 1))
     slow = terms_of(gpu, launch, _scaled(rates, 0))
     slowest, next_slowest = sorted(slow.values(), reverse=True)[:2]
@@ -166,7 +167,7 @@ def add_times(gpu: Gpu, times: Iterable[ModelledTime]) -> ModelledTime:
     )
 
 
-def metrics_of(gpu: Gpu, launches: Sequence[LaunchProfile], time: ModelledTime, rates: Rates) -> Mapping[str, float]:
+def metrics_of(gpu: Gpu, launches: Sequence[LaunchProfile], time: ModelledTime) -> Mapping[str, float]:
     """The metrics of the thesis's table 2, modelled: shares of a unit's peak over the modelled time, in percent.
 
     l2_hit_percent: of all sectors that L2 is asked for; a store that fills its sector counts as a hit.

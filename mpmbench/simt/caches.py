@@ -59,7 +59,7 @@ def pick(key, places):
 def find_line(tags, order, chosen, tag):
     """-> (line, whether it holds the tag) in a set; it counts as used now. A line that does not is the one to evict."""
     first = chosen * WAYS
-    way = np.int32(-1)
+    way: np.int32 | np.int64 = np.int32(-1)
     sought = np.int32(tag)
     for number in range(WAYS):  # no early end: sixteen compares at once
         way = max(way, np.int32(number) if tags[first + number] == sought else np.int32(-1))
@@ -69,7 +69,7 @@ def find_line(tags, order, chosen, tag):
     if found:
         # The place of a way in the order is the lowest four bits that differ from it in nothing.
         differs = word ^ (np.uint64(way) * _EACH)
-        shift = _trailing_zeros((differs - _EACH) & ~differs & _TOP) & np.uint64(0x3C)
+        shift = _trailing_zeros((differs - _EACH) & ~differs & _TOP) & np.uint64(0x3C)  # type: ignore[call-arg]
     else:
         way = np.int64(word >> _U60)
     before = word & ((_ONE << shift) - _ONE)

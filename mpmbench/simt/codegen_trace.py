@@ -51,6 +51,9 @@ def take_shared(g: _Generator, sites: Sequence[Site], taken: str) -> None:
     _add(g, scheduler.CONTEXT_SHARED, w.value(f"mul i64 {taken}, {passes}"))
     w.declare("declare i64 @llvm.usub.sat.i64(i64, i64)")
     more = w.value(f"call i64 @llvm.usub.sat.i64(i64 {taken}, i64 1)")
+    if is_loop:
+        slots = w.value(f"mul i64 {g.job_field('cas_issue')}, {len(sites)}")
+        _add(g, scheduler.CONTEXT_ISSUE, w.value(f"mul i64 {taken}, {slots}"))
     cycles = g.job_field("cas_trip") if is_loop else "1"
     _add(g, scheduler.CONTEXT_CLOCK, w.value(f"mul i64 {w.value(f'mul i64 {more}, {cycles}')}, {len(sites)}"))
 

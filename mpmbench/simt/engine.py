@@ -178,6 +178,7 @@ class Kernel:
     def _profile(self, job: _Job, machine: Machine | None, arguments: Sequence[Any]) -> tuple[int, MemoryCounters]:
         """Run all thread blocks on a modelled machine."""
         from mpmbench.simt.memory_system import MemorySystem
+        from mpmbench.simt.scheduler import ISSUE_UNITS
         from mpmbench.simt.timing import cas_trip_cycles, timing_tables
 
         if machine is None:
@@ -186,6 +187,7 @@ class Kernel:
         tables = timing_tables(kernel, self.facts.segments, self.facts.sites, machine)
         job.set("segments", tables.segments.ctypes.data)
         job.set("cas_trip", cas_trip_cycles(machine))
+        job.set("cas_issue", round(machine.cas_issue_cycles * ISSUE_UNITS))
         blocks = job.get("grid_x") * job.get("grid_y") * job.get("grid_z")
         arrays = [a for a in arguments if isinstance(a, np.ndarray) and a.ndim > 0]
         return MemorySystem(machine, self.facts, tables).run(self._code.address("resume"), job, blocks, arrays)

@@ -31,6 +31,7 @@ class Machine:
     block_start: int = 0  # cycles between the end of a thread block and the start of the next one in its place
     # What a warp takes of its SM's issue slots for a PTX instruction [cycles]; a quarter if four warps issue at once.
     issue_cycles: Callable[[Instruction], float] = lambda instruction: 0.25
+    cas_issue_cycles: float = 1.25  # the same for one round of a float atomic in shared memory
 
 
 @dataclass

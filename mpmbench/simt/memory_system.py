@@ -341,7 +341,7 @@ def replay(
                     contexts[at + _TRACE_AT] = trace_at
                     contexts[at + _TRACE_END] = trace_at + TRACE_LIMIT * (8 * RECORD_WORDS)
                     context = launch[_CONTEXTS] + warp * launch[_CONTEXT_BYTES]
-                    status = _run_code(launch[_CODE], context, jobs_at + slot * (8 * _JOB_WORDS))
+                    status: int = _run_code(launch[_CODE], context, jobs_at + slot * (8 * _JOB_WORDS))  # type: ignore[call-arg]
                     if status >= _FIRST_FAULT:
                         outcome[_FAULT] = status
                         outcome[_STOP_SLOT] = slot

@@ -39,7 +39,8 @@ JOB_FIELDS = (
     "stranded",  # thread blocks in which some warps ended while others waited at a barrier (debug)
     "stranded_segment",
     "segments",  # address of a table: cycles and issue slots of each segment (profile)
-    "cas_trip",  # cycles of one round of a float atomic in shared memory (profile)
+    "cas_trip",  # cycles of one round of a float atomic in shared memory,
+    "cas_issue",  # and what it takes of the issue slots (profile)
     # Votes of reducing barriers (lanes that hold the predicate, lanes that arrived), three barriers in rotation: while
     # one is read and the next is filled, the third is cleared.
     "votes_0",
