@@ -241,11 +241,14 @@ def test_freeze_then_score_then_change(command, tmp_path) -> None:
     assert "a latency term" in html.read_text()
 
 
-def test_a_row_that_failed_is_a_harness_error(command) -> None:
+def test_a_row_that_failed_is_a_harness_error(command, tmp_path) -> None:
     command.state["rows"] = [row(5, "AoS", 243, None, failed="no memory"), *thesis_rows()[1:]]
-    result = command()
+    target = tmp_path / "score.json"
+    result = command("--json", str(target))
     assert result.exit_code == 1
     assert "missed median" in result.output
+    first = json.loads(target.read_text())["rows"][0]
+    assert (first["modelled_us"], first["comparable"], first["reason"]) == (None, True, "no memory")
 
 
 @pytest.mark.parametrize(
