@@ -24,6 +24,7 @@ def reproduce() -> None:
 @click.option("--html", "html_path", type=click.Path(path_type=Path), metavar="FILE", help="One page, misses first.")
 @click.option("--freeze", metavar="VERSION", help="Fix constants, kernels, datasets and scored rows as v1, v2, ...")
 @click.option("--reason", default="", metavar="TEXT", help="Why: needed by --freeze.")
+@click.option("--calibrate", is_flag=True, help="Set the calibrated constants anew from their three cells.")
 @click.option("--record-score", is_flag=True, help="Put this score, its first, into the newest frozen version.")
 @click.option(
     "--verify",
@@ -40,6 +41,7 @@ def thesis(
     html_path: Path | None,
     freeze: str | None,
     reason: str,
+    calibrate: bool,
     record_score: bool,
     verify_paths: Sequence[Path],
     jobs: int,
@@ -72,6 +74,10 @@ def thesis(
     constants = rows.model_constants(gpu)
     with cli._progress() as progress:
         found = rows.thesis_rows(gpu, constants, cli._step_by_step(progress), jobs=jobs, cache=cache)
+    if calibrate:
+        path = rows.write_calibration(found, gpu)
+        _say(f"wrote {path}: run again to use it")
+        return
     judged = judge(found)
     if freeze is not None:
         path, version = frozen.freeze(freeze, reason, gpu.name, constants, judged)

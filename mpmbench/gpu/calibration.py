@@ -43,3 +43,16 @@ def calibrate(cells: Mapping[tuple[int, str], Cell], launch_overhead: float) -> 
         "row_activation_rate": rate("row_activation_rate", "dram_activations"),
         "atomic_word_rate": rate("atomic_word_rate", "atomic_lanes"),
     }
+
+
+def to_toml(constants: Mapping[str, float]) -> str:
+    """The file that stands in ``gpu/calibrated/``."""
+    lines = [
+        "# Written by mpmbench reproduce thesis --calibrate: three constants, each from one printed time.",
+        "[constants]",
+    ]
+    for name, value in constants.items():
+        table, row = CELLS[name]
+        source = f"calibrated: the thesis, table {table}, {row}"
+        lines.append(f'{name} = {{ value = {value:.6g}, source = "{source}", confidence = "medium" }}')
+    return "\n".join(lines) + "\n"

@@ -33,6 +33,7 @@ ERROR = 1.25  # what models of this kind reach on codes that they were not made 
 ATOMIC_RANGE = (0.5, 4.0)  # of one addition per cycle and L2 slice, where no rate is known
 ACTIVATION_RANGE = (0.5, 2.0)  # of the calibrated rate per bank, where no rate is known
 CALIBRATED_GPU = "gtx970"
+UNCALIBRATED_BANK = 1e7  # activations/s of a bank before anything was calibrated: one every 100 ns
 CAS_WAVEFRONTS = 3  # a round loads (1) and swaps (2)
 
 
@@ -70,7 +71,8 @@ def rates_of(gpu: Gpu) -> Rates:
 @cache
 def _activations_per_bank() -> float:
     gpu = get_gpu(CALIBRATED_GPU)
-    return (gpu.get("row_activation_rate") or 0.0) / (gpu["dram_channels"] * gpu["dram_banks"])
+    rate = gpu.get("row_activation_rate")
+    return rate / (gpu["dram_channels"] * gpu["dram_banks"]) if rate else UNCALIBRATED_BANK
 
 
 def busy_sms(gpu: Gpu, blocks: int) -> float:

@@ -14,7 +14,8 @@ from typing import Any
 from mpmbench import presets
 from mpmbench.device import KernelInfo, LaunchProfile
 from mpmbench.environment import Environment
-from mpmbench.gpu import Constant, Gpu
+from mpmbench.gpu import CALIBRATED, Constant, Gpu
+from mpmbench.gpu.calibration import CELLS, Cell, calibrate, to_toml
 from mpmbench.gpu.model import metrics_of, model_launches, rates_of
 from mpmbench.gpu.modelled import ModelledTime
 from mpmbench.primitive_runs import PrimitiveCase
@@ -91,10 +92,8 @@ def thesis_rows(
     keys = [_key(case, gpu) for case in cases]
     counted = {key: found for key in keys if cache and (found := _load(key)) is not None}
     missing = [(key, case) for key, case in zip(keys, cases, strict=True) if key not in counted]
-    for key, found in _count(missing, gpu, jobs, progress, len(counted), len(cases)):
+    for key, found in _count(missing, gpu, jobs, cache, progress, len(counted), len(cases)):
         counted[key] = found
-        if cache and not found["failed"]:
-            disk.store("rows", key, json.dumps(found).encode())
     chosen = replace(gpu, constants=dict(constants))
     return [_row(case, gpu, chosen, counted[key]) for key, case in zip(keys, cases, strict=True)]
 
@@ -114,6 +113,22 @@ def retime(rows: Sequence[Row], constants: Constants) -> list[Row]:
         launches = [_with_latencies(launch, row.state.gpu, gpu) for launch in row.state.launches]
         result.append(replace(row, modelled=model_launches(gpu, launches, rates_of(gpu))))
     return result
+
+
+def write_calibration(rows: Sequence[Row], gpu: Gpu) -> Path:
+    """Set the calibrated constants from their cells. Raises InputError where one of those has no counts."""
+    cells = {}
+    for row in rows:
+        if (row.table, row.row) in CELLS.values() and row.state is not None and row.published_us:
+            total = MemoryTally()
+            for launch in row.state.launches:
+                total = total + launch.memory.total
+            cells[row.table, row.row] = Cell(
+                1e-6 * row.published_us, total.dram_sectors, total.dram_activations, total.atomic_lanes
+            )
+    path = CALIBRATED / f"{gpu.name}.toml"
+    path.write_text(to_toml(calibrate(cells, gpu["launch_overhead"])), encoding="utf-8")
+    return path
 
 
 def _with_latencies(launch: LaunchProfile, counted_for: Gpu, gpu: Gpu) -> LaunchProfile:
@@ -169,7 +184,13 @@ def _row(case: Any, gpu: Gpu, chosen: Gpu, found: Mapping[str, Any]) -> Row:
 
 
 def _count(
-    missing: Sequence[tuple[str, Any]], gpu: Gpu, jobs: int, progress: Progress | None, done: int, total: int
+    missing: Sequence[tuple[str, Any]],
+    gpu: Gpu,
+    jobs: int,
+    keep: bool,
+    progress: Progress | None,
+    done: int,
+    total: int,
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Count rows in ``jobs`` processes, those of one dataset side by side in one."""
     tell = progress or (lambda what, done, total: None)
@@ -180,7 +201,7 @@ def _count(
     # A fresh interpreter: compiled code and threads of this one do not survive a fork.
     with ProcessPoolExecutor(min(jobs, len(chunks)), multiprocessing.get_context("spawn")) as pool:
         tasks: list[Future[list[tuple[str, dict[str, Any]]]]] = [
-            pool.submit(_count_chunk, [(key, _number(case)) for key, case in chunk], gpu) for chunk in chunks
+            pool.submit(_count_chunk, [(key, _number(case)) for key, case in chunk], gpu, keep) for chunk in chunks
         ]
         try:
             for task in as_completed(tasks):
@@ -202,10 +223,21 @@ def _inputs() -> Inputs:
     return Inputs()
 
 
-def _count_chunk(items: Sequence[tuple[str, tuple[int, int]]], gpu: Gpu) -> list[tuple[str, dict[str, Any]]]:
-    """In a process of its own: cases hold functions and do not travel, so they are found again by table and place."""
+def _count_chunk(
+    items: Sequence[tuple[str, tuple[int, int]]], gpu: Gpu, keep: bool
+) -> list[tuple[str, dict[str, Any]]]:
+    """In a process of its own: cases hold functions and do not travel, so they are found again by table and place.
+
+    keep: put each row into the cache as soon as it is counted, so that an interruption loses one.
+    """
     cases = {_number(case): case for case in presets.thesis()}
-    return [(key, _count_case(cases[number], gpu)) for key, number in items]
+    counted = []
+    for key, number in items:
+        found = _count_case(cases[number], gpu)
+        if keep and not found["failed"]:
+            disk.store("rows", key, json.dumps(found).encode())
+        counted.append((key, found))
+    return counted
 
 
 def _count_case(case: Case | PrimitiveCase, gpu: Gpu) -> dict[str, Any]:
@@ -243,7 +275,9 @@ def _source_digest() -> str:
 
 def _key(case: Any, gpu: Gpu) -> str:
     """Of a row's counts: the sources, the GPU and what the row executes."""
-    constants = json.dumps({name: constant.value for name, constant in sorted(gpu.constants.items())})
+    constants = json.dumps(
+        {name: constant.value for name, constant in sorted(gpu.constants.items()) if name not in CELLS}
+    )
     what = repr((case.name, sorted(case.axes.items()), getattr(case, "dataset", None), getattr(case, "size", None)))
     recipe = getattr(case, "dataset", None)
     text = (presets.DATASETS_FOLDER / f"{recipe.name}.toml").read_text() if recipe is not None else ""
