@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -18,7 +19,7 @@ from mpmbench.gpu.occupancy import occupancy
 from mpmbench.primitive_runs import PrimitiveCase
 from mpmbench.profile_record import LineProfile, Profile, Residency
 from mpmbench.record import Record
-from mpmbench.runner import Inputs, refuse_bad_input, run_case
+from mpmbench.runner import Inputs, refuse_bad_input, resume_key, run_case
 from mpmbench.simt.counters import SourceLine, Tally
 from mpmbench.simt.machine import MemoryTally
 
@@ -128,27 +129,60 @@ def _lines(launches: Sequence[LaunchProfile], bound: str) -> dict[SourceLine, Li
     }
 
 
-def profile_cases(cases: Sequence[Any], gpus: Sequence[Gpu], progress: Callable[[str, int, int], None]) -> list[Record]:
+def profile_cases(
+    cases: Sequence[Any],
+    gpus: Sequence[Gpu],
+    progress: Callable[[str, int, int], None],
+    keep: Callable[[Record], None] = lambda record: None,
+    known: Sequence[Record] = (),
+) -> list[Record]:
     """Records with ``modelled`` filled for each GPU, one per case and architecture: GPUs of one architecture run the
-    same code and share a record. progress: told what runs, the cases done and the cases in all."""
+    same code and share a record.
+
+    progress: told what runs, the cases done and the cases in all. keep: given each new record as soon as it is whole.
+    known: records of an earlier run, taken as they are where they model the same case on all GPUs asked for.
+    """
     refuse_bad_input(case for case in cases if not isinstance(case, PrimitiveCase))
     environment = Environment.capture()
     inputs = Inputs()
+    earlier = {resume_key(record): record for record in known if record.modelled}
     records: list[Record] = []
-    done, total = 0, len(cases) * len(gpus)
-    for case in cases:
-        by_arch: dict[str, Record] = {}
-        for gpu in gpus:
-            progress(f"{gpu.name} {case.title}", done, total)
-            record = run_modelled(case, Modeller(gpu), inputs, environment)
-            known = by_arch.get(gpu.arch)
-            if known is not None and known.modelled and record.modelled:
-                record = replace(known, modelled={**known.modelled, **record.modelled})
-            by_arch[gpu.arch] = record if known is None or record.modelled else known
-            done += 1
-        records += by_arch.values()
-    progress("done", total, total)
+    groups = list(itertools.product(cases, _by_architecture(gpus)))
+    for done, (case, group) in enumerate(groups):
+        progress(f"{', '.join(gpu.name for gpu in group)}: {case.title}", done, len(groups))
+        found = earlier.get(_resume_key(case, group[0], inputs)) if earlier else None
+        if found is None or not {gpu.name for gpu in group} <= set(found.modelled or ()):
+            found = _profile_group(case, group, inputs, environment)
+            keep(found)
+        records.append(found)
+    progress("done", len(groups), len(groups))
     return records
+
+
+def _by_architecture(gpus: Sequence[Gpu]) -> list[list[Gpu]]:
+    groups: dict[str, list[Gpu]] = {}
+    for gpu in gpus:
+        groups.setdefault(gpu.arch, []).append(gpu)
+    return list(groups.values())
+
+
+def _profile_group(case: Any, group: Sequence[Gpu], inputs: Inputs, environment: Environment) -> Record:
+    """One case on GPUs of one architecture: the same counts, each GPU's own caches. The first record that lacks a
+    model says why."""
+    record = run_modelled(case, Modeller(group[0]), inputs, environment)
+    for gpu in group[1:]:
+        if not record.modelled:
+            break
+        other = run_modelled(case, Modeller(gpu), inputs, environment)
+        if not other.modelled:
+            return other
+        record = replace(record, modelled={**record.modelled, **other.modelled})
+    return record
+
+
+def _resume_key(case: Any, gpu: Gpu, inputs: Inputs) -> tuple[Any, ...]:
+    device = Modeller(gpu).device()
+    return case.resume_key(device) if isinstance(case, PrimitiveCase) else resume_key(case, device, inputs)
 
 
 def run_modelled(case: Any, model: Modeller, inputs: Inputs, environment: Environment) -> Record:

@@ -31,13 +31,15 @@ Progress = Callable[[str, int, int], None]  # (what runs, steps done, steps in a
 # The published rows of these tables time one dispatch and leave partial results; ours go on to one result.
 FIRST_LAUNCH_TABLES = (7, 8)
 
+FORM = "1"  # of what the cache keeps of a row: another one counts anew
+
 CHUNK = 4  # rows that one process counts in a row, so that a dataset is made once
 
 # What a row's counters depend on besides its axes and the GPU: the code that runs and the code that counts.
 _SOURCES = (
     "simt", "raw_kernels", "variants", "primitives", "operations", "device", "gpu/sass.py", "gpu/machine.py",
     "gpu/occupancy.py", "dataset.py", "recipes.py", "motion.py", "plan.py", "preprocess.py", "workspace.py",
-    "kernel.py", "launcher.py", "layout.py", "grid.py", "primitive_runs.py", "runner.py", "profile.py",
+    "kernel.py", "launcher.py", "layout.py", "grid.py",
 )  # fmt: skip
 
 
@@ -282,7 +284,7 @@ def _key(case: Any, gpu: Gpu) -> str:
     recipe = getattr(case, "dataset", None)
     text = (presets.DATASETS_FOLDER / f"{recipe.name}.toml").read_text() if recipe is not None else ""
     table = str((case.preset_row or {})["table"] in FIRST_LAUNCH_TABLES)
-    return disk.content_key("row", _source_digest(), gpu.arch, constants, what, text, table)
+    return disk.content_key("row", FORM, _source_digest(), gpu.arch, constants, what, text, table)
 
 
 def _load(key: str) -> dict[str, Any] | None:
