@@ -1,4 +1,4 @@
-"""The command line: ``mpmbench list | run | check | profile | report | verify | selftest | doctor | env``.
+"""The command line: ``mpmbench list | run | check | profile | report | verify | reproduce | selftest | doctor | env``.
 
 Names and axis syntax follow NVBench. Exit codes: 0 ok, 1 harness error, 2 usage or bad input, 3 regression, 4 wrong
 results or findings, 130 interrupted.
@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table as RichTable
 
+from mpmbench.cli_reproduce import reproduce
 from mpmbench.errors import InputError, MpmbenchError
 
 console = Console(stderr=False, highlight=False)
@@ -279,6 +280,13 @@ def _axis_values(variant: Any) -> dict[str, list[Any]]:
 @click.option("--html", "html_path", type=click.Path(path_type=Path), metavar="FILE", help="One-file report.")
 @click.option("--md", "md_path", type=click.Path(path_type=Path), metavar="FILE", help="Markdown report.")
 @click.option("--csv", "csv_path", type=click.Path(path_type=Path), metavar="FILE", help="One flat row per record.")
+@click.option(
+    "--gpu",
+    "gpu_names",
+    multiple=True,
+    metavar="NAME[,NAME]",
+    help="Model the time on these GPUs, by name or description file (.toml); none need be there.",
+)
 @click.option("--resume", is_flag=True, help="Keep the rows of --json FILE, run only what is missing.")
 @click.option("--dry-run", is_flag=True, help="Say what would run, and stop.")
 def run(
@@ -287,6 +295,7 @@ def run(
     html_path: Path | None,
     md_path: Path | None,
     csv_path: Path | None,
+    gpu_names: Sequence[str],
     resume: bool,
     dry_run: bool,
     devices: Sequence[str],
@@ -300,11 +309,15 @@ def run(
     mpmbench run --quick
     mpmbench run -b "p2g_*" --dataset random -a "batching=[1,4]" --json rows.jsonl --html report.html
     mpmbench run --dataset my_particles.npz
+    mpmbench run --gpu h100,a100,rtx4090 --dataset my_particles.npz --html which_one.html
     """
     cases = _choose(**selection, quick=quick, preset_name=preset_name)
     if resume and json_path is None:
         raise InputError("--resume needs --json FILE, the file whose rows it keeps")
     _refuse_targets([json_path, html_path, md_path, csv_path], selection["datasets"])
+    if gpu_names:
+        _run_modelled(cases, gpu_names, devices, arch, json_path, html_path, md_path, csv_path, resume, dry_run)
+        return
     # The thesis measured a GTX 970: its rows are counted on the code that NVRTC makes for that GPU.
     opened = _open_devices(devices, arch or ("sm_52" if preset_name == "thesis" else None), "count")
     if dry_run:
@@ -419,10 +432,25 @@ def verify(
 
 
 @main.command()
-def doctor() -> None:
+@click.option(
+    "--write-gpu",
+    "gpu_path",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.toml",
+    help="Describe this machine's GPU for --gpu FILE.toml instead; an existing file is left alone.",
+)
+def doctor(gpu_path: Path | None) -> None:
     """What is present, what is missing, and what to do about it."""
     from mpmbench.doctor import diagnose
 
+    if gpu_path is not None:
+        from mpmbench.gpu.write import write_gpu
+
+        gpu = write_gpu(gpu_path)
+        unknown = sum(constant.confidence == "low" for constant in gpu.constants.values())
+        console.print(f"wrote {gpu_path}: {gpu.summary}", markup=False, soft_wrap=True)
+        console.print(f"{unknown} constants are not known for this GPU: those of confidence low", soft_wrap=True)
+        return
     marks = {"ok": "[green]ok     [/]", "warn": "[yellow]warn   [/]", "missing": "[red]missing[/]"}
     for item in diagnose():
         console.print(f"{marks[item.status]} {item.name}: ", end="")
@@ -441,6 +469,37 @@ def env() -> None:
     for name, value in asdict(Environment.capture(argv=[])).items():
         if value not in (None, (), {}):
             click.echo(f"{name}: {value}")
+
+
+main.add_command(reproduce)
+
+
+def _run_modelled(
+    cases: list[Any],
+    gpu_names: Sequence[str],
+    devices: Sequence[str],
+    arch: str | None,
+    json_path: Path | None,
+    html_path: Path | None,
+    md_path: Path | None,
+    csv_path: Path | None,
+    resume: bool,
+    dry_run: bool,
+) -> None:
+    """``run --gpu``: the cases on the simulated device, with the time that named GPUs would take."""
+    if any(device != "simulated" for device in devices):
+        raise InputError("--gpu models times on the simulated device: leave out -d, or leave out --gpu")
+    if arch is not None:
+        raise InputError("--gpu compiles for the GPU that it names: leave out --arch")
+    gpus = cli_profile.parse_gpus(gpu_names)
+    if dry_run:
+        for case in cases:
+            console.print(f"{', '.join(gpu.name for gpu in gpus)}  {case.title}", markup=False, soft_wrap=True)
+        console.print(f"{len(cases)} cases on {len(gpus)} GPUs")
+        return
+    records = cli_profile.model_cases(cases, gpus, json_path, resume)
+    _write_reports(records, html_path, md_path, csv_path)
+    _summarise(records, [p for p in (json_path, html_path, md_path, csv_path) if p])
 
 
 # --- running ----------------------------------------------------------------------------------------------------------
@@ -587,7 +646,7 @@ def _summarise(records: list[Any], written: Sequence[Path]) -> None:
         sys.exit(1)
 
 
-from mpmbench import cli_profile  # noqa: E402, F401  # adds its command to main; it needs what stands above
+from mpmbench import cli_profile  # noqa: E402  # adds its command to main; it needs what stands above
 
 if __name__ == "__main__":
     main()

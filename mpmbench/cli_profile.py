@@ -23,7 +23,7 @@ from mpmbench.cli import (
 )
 from mpmbench.errors import InputError
 from mpmbench.gpu import Gpu, get_gpu, list_gpus
-from mpmbench.record import Record, RecordWriter
+from mpmbench.record import Record, RecordWriter, read_records
 from mpmbench.runner import Case, format_axis
 
 
@@ -89,14 +89,7 @@ def profile(
     outputs = [json_path, html_path, md_path]
     _refuse_targets(outputs, [*selection["datasets"], *([ncu_csv] if ncu_csv else [])])
     measured = _read_ncu(ncu_csv, cases, gpus) if ncu_csv else {}
-    from mpmbench.profile import profile_cases
-
-    with _progress() as progress:
-        records = profile_cases(cases, gpus, _step_by_step(progress))
-    if json_path:
-        with RecordWriter(json_path, "replace") as writer:
-            for record in records:
-                writer.write(record)
+    records = model_cases(cases, gpus, json_path, resume=False)
     _write_reports(records, html_path, md_path, None)
     _print_profiles(records)
     for record in records:
@@ -104,6 +97,21 @@ def profile(
             _print_beside_ncu(record, measured[kernel], gpus[0])
     sys.stdout.flush()
     _summarise(records, [path for path in outputs if path])
+
+
+def model_cases(cases: Sequence[Any], gpus: Sequence[Gpu], json_path: Path | None, resume: bool) -> list[Record]:
+    """Run, check and model cases; each record is in --json FILE before the next case begins."""
+    from mpmbench.profile import profile_cases
+
+    known = read_records(json_path) if resume and json_path is not None and json_path.exists() else []
+    writer = RecordWriter(json_path, "append" if resume else "replace") if json_path else None
+    try:
+        with _progress() as progress:
+            keep = writer.write if writer else lambda record: None
+            return profile_cases(cases, gpus, _step_by_step(progress), keep, known)
+    finally:
+        if writer:
+            writer.close()
 
 
 def _print_profiles(records: Sequence[Record]) -> None:

@@ -18,7 +18,7 @@ from mpmbench.launcher import INT32_LIMIT
 from mpmbench.measure import Sampling, measure_steps
 from mpmbench.primitives import Arrays, Bench, Built, Primitive, resolve_axes, why_impossible
 from mpmbench.record import Check, DatasetSummary, Record
-from mpmbench.runner import format_axis, free_bytes, kernel_facts
+from mpmbench.runner import Model, format_axis, free_bytes, kernel_facts
 from mpmbench.workspace import Step
 
 SEED = 1
@@ -49,10 +49,12 @@ class PrimitiveCase:
         differing = [f"{k}={format_axis(v)}" for k, v in self.axes.items() if defaults.get(k) != v]
         return " ".join([self.primitive.name, str(self.size), *differing])
 
-    def run(self, device: Device, environment: Environment, sampling: Sampling | None = None) -> Record:
+    def run(
+        self, device: Device, environment: Environment, sampling: Sampling | None = None, model: Model | None = None
+    ) -> Record:
         """``run_primitive`` for this case."""
         return run_primitive(
-            self.primitive, device, self.axes, self.size, self.seed, environment, sampling, self.preset_row
+            self.primitive, device, self.axes, self.size, self.seed, environment, sampling, self.preset_row, model
         )
 
     def resume_key(self, device: Device) -> tuple[Any, ...]:
@@ -92,10 +94,11 @@ def run_primitive(
     environment: Environment,
     sampling: Sampling | None = None,
     preset_row: Mapping[str, Any] | None = None,
+    model: Model | None = None,
 ) -> Record:
     """Run, check, and count or measure a primitive. What goes wrong becomes the record's reason, not an exception.
 
-    axes: as ``resolve_axes`` returns them.  size: of the input, in the operation's unit.
+    axes: as ``resolve_axes`` returns them.  size: of the input, in the operation's unit.  model: as for ``run_case``.
     """
     operation = primitive.operation
     if not 0 <= size < INT32_LIMIT:
@@ -134,6 +137,8 @@ def run_primitive(
     except InputError as error:
         return Record(**about, failed_because=str(error), host_seconds=time.perf_counter() - begin)
     about |= {"check": Check.of(check), "findings": (*findings, *report.findings)}
+    if model is not None and check.passed:
+        about["modelled"] = model({}, report, {})
     if device.name != "simulated" and check.passed:
         before = [Step("before", built.before)] if built.before else []
         step = Step("transfer", built.launches)

@@ -17,10 +17,11 @@ import numpy as np
 from mpmbench import plan as planning
 from mpmbench.check import CheckResult, check_g2p, check_p2g
 from mpmbench.dataset import Dataset, load_dataset
-from mpmbench.device import Device, Launch
+from mpmbench.device import Device, Launch, LaunchReport
 from mpmbench.environment import Environment, machine_bytes
 from mpmbench.errors import InputError
 from mpmbench.measure import Sampling, measure_plan
+from mpmbench.profile_record import Profile
 from mpmbench.record import Check, DatasetSummary, Record, StepCost, line_texts
 from mpmbench.reference import Nodes, ReferenceNodes, ReferenceParticles, g2p, grid_divide, p2g
 from mpmbench.simt.counters import Counters
@@ -155,10 +156,22 @@ class Inputs:
         return self.references[transfer, *how]
 
 
+# (reports of the steps before, of the transfer, of the steps after) -> what a record says of named GPUs.
+Model = Callable[[Mapping[str, LaunchReport], LaunchReport, Mapping[str, LaunchReport]], Mapping[str, Profile]]
+
+
 def run_case(
-    case: Case, device: Device, inputs: Inputs, environment: Environment, sampling: Sampling | None = None
+    case: Case,
+    device: Device,
+    inputs: Inputs,
+    environment: Environment,
+    sampling: Sampling | None = None,
+    model: Model | None = None,
 ) -> Record:
-    """Run, check, and count or measure one case. Errors of the case become its record's reason, not an exception."""
+    """Run, check, and count or measure one case. Errors of the case become its record's reason, not an exception.
+
+    model: asked for modelled times once the result is known to be right; for a device in mode profile.
+    """
     variant, axes = case.variant, case.axes
     dataset = inputs.select(case.dataset)
     about: dict[str, Any] = {
@@ -193,13 +206,19 @@ def run_case(
         )
     begin = time.perf_counter()
     try:
-        return _run(case, device, inputs, about, sampling, begin)
+        return _run(case, device, inputs, about, sampling, begin, model)
     except InputError as error:
         return Record(**about, failed_because=str(error), host_seconds=time.perf_counter() - begin)
 
 
 def _run(
-    case: Case, device: Device, inputs: Inputs, about: dict[str, Any], sampling: Sampling | None, begin: float
+    case: Case,
+    device: Device,
+    inputs: Inputs,
+    about: dict[str, Any],
+    sampling: Sampling | None,
+    begin: float,
+    model: Model | None,
 ) -> Record:
     variant, axes, dataset = case.variant, case.axes, inputs.dataset
     assert dataset is not None
@@ -217,6 +236,8 @@ def _run(
         if counters is not None:
             about["preprocess"] = {name: StepCost(counters=report.counters) for name, report in preprocess.items()}
             about["finish"] = {name: StepCost(counters=report.counters) for name, report in finish.items()}
+            if model is not None:
+                about["modelled"] = model(preprocess, transfer, finish)
     elif check.passed:
         times = measure_plan(device, plan, check, sampling)  # type: ignore[arg-type]
         about["transfer_measurement"] = times.transfer

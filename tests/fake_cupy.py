@@ -350,7 +350,10 @@ def fake_cupy(gpu: FakeGpu) -> SimpleNamespace:
         properties = {
             "name": b"Fake GPU", "l2CacheSize": gpu.l2_bytes, "sharedMemPerBlockOptin": gpu.shared_optin,
             "totalGlobalMem": gpu.memory_bytes, "multiProcessorCount": 4, "clockRate": 1_000_000,
-            "memoryClockRate": 2_000_000, "memoryBusWidth": 256, "ECCEnabled": 0, "uuid": b"\0" * 16,
+            "memoryClockRate": 2_000_000, "memoryBusWidth": 256, "ECCEnabled": 0,
+            "maxThreadsPerMultiProcessor": 2048, "maxBlocksPerMultiProcessor": 32, "regsPerMultiprocessor": 65_536,
+            "sharedMemPerMultiprocessor": gpu.shared_optin + 1024, "reservedSharedMemPerBlock": 1024,
+            "uuid": b"\0" * 16,
         }  # fmt: skip
         assert device < gpu.count
         return properties

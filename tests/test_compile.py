@@ -280,6 +280,7 @@ def test_facts_come_from_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     first = kernel_infos(ptx, "sm_90")
     monkeypatch.setattr(ptxas, "assemble", lambda *_: pytest.fail("assembled again"))
     assert kernel_infos(ptx, "sm_90") == first
+    assert first["nothing"].sass_instructions
 
 
 def test_axes_are_all_covered() -> None:

@@ -159,13 +159,15 @@ def test_facts_for_the_record(gpu: FakeGpu) -> None:
 def test_kernel_info(gpu: FakeGpu, monkeypatch: pytest.MonkeyPatch) -> None:
     device = CudaDevice("cuda")
     kernel = device.compile(source(AXPY), "axpy")
-    assert device.info(kernel) == KernelInfo("sm_90", 32, 32, 32, spill_bytes=0)
+    info = device.info(kernel)
+    assert info == KernelInfo("sm_90", 32, 32, 32, spill_bytes=0, sass_instructions=info.sass_instructions)
+    assert info.sass_instructions
 
     def missing(*_):
         raise InputError("no ptxas")
 
     monkeypatch.setattr("mpmbench.device.cuda.source_infos", missing)
-    assert device.info(kernel).spill_bytes is None
+    assert device.info(kernel) == KernelInfo("sm_90", 32, 32, 32)
 
 
 def test_large_shared_memory_is_asked_for_once(gpu: FakeGpu) -> None:

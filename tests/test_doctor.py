@@ -9,11 +9,15 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from click.testing import CliRunner
 from fake_cupy import FakeGpu, fake_cupy
 
 from mpmbench import doctor
+from mpmbench.cli import main
 from mpmbench.doctor import Check, diagnose, satisfies
 from mpmbench.errors import InputError
+from mpmbench.gpu import MEANINGS, Constant, get_gpu
+from mpmbench.gpu.write import describe, most_similar
 
 
 def by_name(checks: list[Check]) -> dict[str, Check]:
@@ -231,3 +235,63 @@ def test_questions_that_the_driver_refuses(monkeypatch: pytest.MonkeyPatch) -> N
     assert doctor.driver()[0].status == "missing"
     installed(monkeypatch, nvidia_ml_py=None)
     assert doctor.driver()[0].remedy == "pip install nvidia-ml-py"
+
+
+def test_this_gpu_is_described(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cupy", fake_cupy(FakeGpu(capability="86", memory_bytes=8 << 30)))
+    path = tmp_path / "mine.toml"
+    result = CliRunner().invoke(main, ["doctor", "--write-gpu", str(path)])
+    assert result.exit_code == 0, result.output
+    assert "Fake GPU: sm_86, 4 SMs at 1000 MHz, 128 GB/s" in result.output
+    gpu, similar = get_gpu(path), get_gpu("rtx3090")
+    assert (gpu.name, gpu.title, gpu.arch) == ("mine", "Fake GPU", "sm_86")
+    told = {"sm_count": 4, "clock_mhz": 1000, "warps_per_sm": 64, "blocks_per_sm": 32, "registers_per_sm": 65_536,
+            "shared_bytes_per_sm": 233_472, "shared_bytes_per_block": 232_448, "shared_reserved_bytes_per_block": 1024,
+            "l2_bytes": 1 << 20, "memory_bytes": 8 << 30, "dram_bandwidth": 128e9}  # fmt: skip
+    for name, value in told.items():
+        assert gpu.constants[name] == Constant(value, "CUDA driver of this machine", "high"), name
+    for name, constant in gpu.constants.items():
+        if name not in told:
+            assert constant.confidence == "low"
+            assert "taken from NVIDIA GeForce RTX 3090" in constant.source
+            assert constant.value == similar[name] or name == "dram_bandwidth_achieved"
+    assert gpu["dram_bandwidth_achieved"] == pytest.approx(128e9 * 913 / 936)
+    assert set(gpu.constants) == set(similar.constants)
+    assert all(f"# {meaning}\n" in path.read_text() for name, meaning in MEANINGS.items() if name in gpu.constants)
+
+    before = path.read_text()
+    again = CliRunner().invoke(main, ["doctor", "--write-gpu", str(path)])
+    assert (again.exit_code, path.read_text()) == (2, before)
+    assert again.output.count("\n") == 1
+    assert "mine.toml exists and is not overwritten" in again.output
+
+
+def test_without_a_gpu_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cupy", fake_cupy(FakeGpu(fail_count=RuntimeError("no driver"))))
+    path = tmp_path / "mine.toml"
+    result = CliRunner().invoke(main, ["doctor", "--write-gpu", str(path)])
+    assert result.exit_code == 2
+    assert result.output.startswith("mpmbench: no GPU for device 'cuda'")
+    assert result.output.count("\n") == 1
+    assert not path.exists()
+    for name, message in (("mine.json", "is a .toml file"), ("no/such/folder.toml", "cannot write")):
+        monkeypatch.setitem(sys.modules, "cupy", fake_cupy(FakeGpu()))
+        result = CliRunner().invoke(main, ["doctor", "--write-gpu", str(tmp_path / name)])
+        assert (result.exit_code, message in result.output) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("arch", "sms", "expected"),
+    [("sm_90", 132, "h100_sxm"), ("sm_90", 114, "h100"), ("sm_86", 28, "rtx3090"), ("sm_75", 40, "v100"),
+     ("sm_88", 10, "rtx3090"), ("sm_61", 28, "gtx970"), ("sm_120", 170, "h100_sxm"), ("sm_50", 5, "gtx970")],
+)  # fmt: skip
+def test_what_is_unknown_comes_from_a_similar_gpu(arch: str, sms: int, expected: str) -> None:
+    assert most_similar(arch, sms).name == expected
+
+
+def test_what_a_driver_does_not_tell_is_taken_too() -> None:
+    properties = fake_cupy(FakeGpu()).cuda.runtime.getDeviceProperties(0) | {"clockRate": 0, "memoryClockRate": 0}
+    gpu = describe("mine", "sm_75", properties)
+    assert gpu["clock_mhz"] == get_gpu("v100")["clock_mhz"]
+    assert gpu["dram_bandwidth_achieved"] == get_gpu("v100")["dram_bandwidth_achieved"]
+    assert "of another architecture (sm_70)" in gpu.constants["clock_mhz"].source

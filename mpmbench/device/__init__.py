@@ -6,7 +6,7 @@ and gives results, counters and findings, but never a time of its own.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -15,6 +15,7 @@ import numpy as np
 from mpmbench.errors import InputError
 from mpmbench.kernel import KernelSource
 from mpmbench.simt.counters import Counters, Finding
+from mpmbench.simt.machine import MemoryCounters
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ class KernelInfo:
     shared_bytes: int | None = None  # static, per thread block
     local_bytes: int | None = None  # stack per thread
     spill_bytes: int | None = None  # spill stores + spill loads per thread
+    sass_instructions: int | None = None  # machine instructions in the code, each counted once
 
 
 @dataclass(frozen=True)
@@ -54,11 +56,30 @@ class Launch:
 
 
 @dataclass(frozen=True)
+class LaunchProfile:
+    """One launch on a modelled machine: all that a performance model needs.
+
+    blocks, threads: thread blocks of the launch, threads of each.  shared_bytes: static and dynamic, per thread block.
+    opcodes: executions by a warp of each PTX opcode with each integer literal (None: without).
+    """
+
+    entry: str
+    blocks: int
+    threads: int
+    shared_bytes: int
+    info: KernelInfo
+    counters: Counters
+    memory: MemoryCounters
+    opcodes: Mapping[tuple[str, int | None], int] = field(repr=False)
+
+
+@dataclass(frozen=True)
 class LaunchReport:
-    """What a launch tells besides its outputs; on ``cuda`` both are empty."""
+    """What a launch tells besides its outputs; on ``cuda`` all are empty. profiles: one per launch in mode profile."""
 
     counters: Counters | None = None
     findings: tuple[Finding, ...] = ()
+    profiles: tuple[LaunchProfile, ...] = ()
 
 
 class Device(Protocol):
@@ -91,18 +112,21 @@ def run_all(device: Device, launches: Sequence[Launch]) -> LaunchReport:
     """Run launches in order and add up what they report."""
     counters: Counters | None = None
     findings: list[Finding] = []
+    profiles: list[LaunchProfile] = []
     for launch in launches:
         report = device.launch(launch)
+        profiles.extend(report.profiles)
         if report.counters is not None:
             counters = report.counters if counters is None else counters + report.counters
         findings.extend(report.findings)
-    return LaunchReport(counters, tuple(findings))
+    return LaunchReport(counters, tuple(findings), tuple(profiles))
 
 
 def open_device(name: str, **options: Any) -> Device:
     """Open ``simulated``, ``cuda`` or ``cuda:N``.
 
-    Options of ``simulated``: arch ("sm_52", ...), mode ("run", "count", "debug"), seed (warp order in debug mode).
+    Options of ``simulated``: arch ("sm_52", ...), mode ("run", "count", "debug", "profile"), seed (warp order in
+    debug mode), machine (what mode profile models).
     Raises InputError for an unknown name, and where there is no GPU or no CuPy.
     """
     if name == "simulated":

@@ -167,22 +167,23 @@ class CudaDevice:
         self._cupy.copyto(order, self._cupy.argsort(keys))
 
     def info(self, kernel: CompiledKernel) -> KernelInfo:
-        """What the driver says of the loaded kernel. It counts spills as local memory: how many they are says
-        ``ptxas``, where it is installed and knows this GPU; else ``spill_bytes`` is None."""
+        """What the driver says of the loaded kernel. It counts spills as local memory: how many they are and how many
+        instructions there are says ``ptxas``, where it is installed and knows this GPU; else both are None."""
         if kernel.handle == self._argsort:
             return KernelInfo(arch=self.arch)
         with self._errors(f"cannot ask for the attributes of {kernel.entry}"), self._current():
             attributes = kernel.handle.attributes
         try:
-            spill_bytes = source_infos(kernel.source, self.arch)[kernel.entry].spill_bytes
+            assembled = source_infos(kernel.source, self.arch)[kernel.entry]
         except InputError:
-            spill_bytes = None
+            assembled = KernelInfo(arch=self.arch)
         return KernelInfo(
             arch=self.arch,
             registers=attributes["num_regs"],
             shared_bytes=attributes["shared_size_bytes"],
             local_bytes=attributes["local_size_bytes"],
-            spill_bytes=spill_bytes,
+            spill_bytes=assembled.spill_bytes,
+            sass_instructions=assembled.sass_instructions,
         )
 
     def launch(self, launch: Launch) -> LaunchReport:

@@ -1,4 +1,4 @@
-"""Registers, shared memory and spills of a kernel for any architecture, from NVIDIA's ``ptxas``; no GPU needed.
+"""Registers, shared memory, spills and size of a kernel for any architecture, from NVIDIA's ``ptxas``; no GPU needed.
 
 ``ptxas`` comes in the wheel nvidia-cuda-nvcc-cu12. What it says for PTX is what the driver's own assembler of the same
 version would load.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import os
 import re
 import subprocess
 import tempfile
@@ -16,10 +15,11 @@ from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
 
-from mpmbench.device import KernelInfo
+from mpmbench.device import KernelInfo, cubin
 from mpmbench.errors import InputError
 from mpmbench.kernel import COMPILE_OPTIONS, KernelSource
 from mpmbench.simt import cache
+from mpmbench.simt.counters import SourceLine
 from mpmbench.simt.nvrtc import compile_cuda
 
 CURE = "pip install 'nvidia-cuda-nvcc-cu12==12.9.*'"
@@ -56,10 +56,12 @@ def kernel_infos(ptx: str, arch: str) -> dict[str, KernelInfo]:
 
     Raises InputError where ``ptxas`` is missing or refuses the text.
     """
-    key = cache.content_key("ptxas", ptxas_version(), arch, ptx)
+    key = cache.content_key("facts", _reader(), ptxas_version(), arch, ptx)
     if (stored := cache.load("ptxas", key)) is not None:
         return {entry: KernelInfo(**facts) for entry, facts in json.loads(stored).items()}
-    infos = parse_log(assemble(ptx, arch), arch)
+    log, code = assemble(ptx, arch)
+    counts = cubin.instruction_counts(code, arch)
+    infos = {n: replace(info, sass_instructions=counts[n]) for n, info in parse_log(log, arch).items()}
     cache.store("ptxas", key, json.dumps({entry: asdict(info) for entry, info in infos.items()}).encode())
     return infos
 
@@ -69,17 +71,31 @@ def source_infos(source: KernelSource, arch: str) -> dict[str, KernelInfo]:
     return kernel_infos(compile_cuda(source.text, arch, COMPILE_OPTIONS, f"{source.name}.cu"), arch)
 
 
-def assemble(ptx: str, arch: str) -> str:
-    """Run ``ptxas -v`` on PTX text and return its log; the machine code is thrown away."""
+def sass_lines(ptx: str, arch: str, entry: str) -> dict[SourceLine, int]:
+    """Machine instructions of kernel ``entry`` by CUDA source line; kept on disk.
+
+    Empty where the PTX has no line information. Raises InputError as ``kernel_infos`` does.
+    """
+    key = cache.content_key("SASS lines", _reader(), ptxas_version(), arch, entry, ptx)
+    if (stored := cache.load("ptxas", key)) is not None:
+        return {SourceLine(file, line): count for file, line, count in json.loads(stored)}
+    lines = cubin.line_counts(assemble(ptx, arch, "-lineinfo")[1], arch, entry)
+    cache.store("ptxas", key, json.dumps([(*line, count) for line, count in lines.items()]).encode())
+    return lines
+
+
+def assemble(ptx: str, arch: str, *options: str) -> tuple[str, bytes]:
+    """Run ``ptxas -v`` on PTX text; return its log and the ELF file with the machine code."""
     with tempfile.TemporaryDirectory(prefix="mpmbench-ptxas-") as folder:
-        source = Path(folder, "kernel.ptx")
+        source, target = Path(folder, "kernel.ptx"), Path(folder, "kernel.cubin")
         source.write_text(ptx)
-        done = _call([str(find_ptxas()), "-v", "-arch", arch, "-o", os.devnull, str(source)])
+        done = _call([str(find_ptxas()), "-v", "-arch", arch, *options, "-o", str(target), str(source)])
+        code = target.read_bytes() if target.exists() else b""
     log = (done.stdout + done.stderr).replace(str(source), "kernel.ptx")
     if done.returncode != 0:
         lines = [line for line in log.splitlines() if "error" in line or "fatal" in line] or log.splitlines()
         raise InputError(f"ptxas refuses the kernel for {arch}: {lines[0].strip() if lines else 'no message'}")
-    return log
+    return log, code
 
 
 def parse_log(log: str, arch: str) -> dict[str, KernelInfo]:
@@ -115,6 +131,12 @@ def parse_log(log: str, arch: str) -> dict[str, KernelInfo]:
     if function_spill:
         infos = {n: replace(info, spill_bytes=(info.spill_bytes or 0) + function_spill) for n, info in infos.items()}
     return infos
+
+
+@lru_cache(maxsize=1)
+def _reader() -> str:
+    """Digest of what reads the log and the machine code: what is kept on disk is stale once either changes."""
+    return cache.content_key(Path(__file__).read_bytes(), Path(cubin.__file__).read_bytes())
 
 
 def _call(command: list[str]) -> subprocess.CompletedProcess[str]:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from mpmbench.device import CompiledKernel, KernelInfo, Launch, LaunchReport
+from mpmbench.device import CompiledKernel, KernelInfo, Launch, LaunchProfile, LaunchReport
 from mpmbench.errors import InputError
 from mpmbench.kernel import COMPILE_OPTIONS, KernelSource
+from mpmbench.simt.machine import Machine
 from mpmbench.simt.nvrtc import compile_cuda, supported_archs
 
-MODES = ("run", "count", "debug", "oracle")
+MODES = ("run", "count", "debug", "profile", "oracle")
 ALIGNMENT = 256  # bytes, as cudaMalloc guarantees: sector counts depend on it
 POISON = 0xFF  # every byte of fresh memory in debug mode: a NaN for both float types
 
@@ -20,17 +23,27 @@ class SimulatedDevice:
     """Runs kernels warp by warp; arrays are NumPy arrays.
 
     arch: what NVRTC compiles for.  mode: "run" gives results only, "count" counters too, "debug" findings (slow),
-    "oracle" the plain NumPy executor that the engine is held to (very slow).  seed: warp order in debug mode.
+    "profile" counters of a modelled GPU's memory system too, "oracle" the plain NumPy executor that the engine is held
+    to (very slow).  seed: warp order in debug mode.  machine: (facts of a kernel, threads and shared bytes per thread
+    block) -> the machine that mode profile models.
     """
 
     name = "simulated"
 
-    def __init__(self, arch: str = "sm_90", mode: str = "count", seed: int = 0) -> None:
+    def __init__(
+        self,
+        arch: str = "sm_90",
+        mode: str = "count",
+        seed: int = 0,
+        machine: Callable[[KernelInfo, int, int], Machine] | None = None,
+    ) -> None:
         if mode not in MODES:
             raise InputError(f"unknown mode {mode!r} of the simulated device: valid are {', '.join(MODES)}")
         if arch not in (known := supported_archs()):
             raise InputError(f"NVRTC cannot compile for {arch!r}: valid are {', '.join(known)}")
-        self.arch, self.mode, self.seed = arch, mode, seed
+        if mode == "profile" and machine is None:
+            raise InputError("mode 'profile' needs a machine to model")
+        self.arch, self.mode, self.seed, self.machine = arch, mode, seed, machine
         self._modules: dict[str, Any] = {}
 
     def upload(self, host: np.ndarray) -> np.ndarray:
@@ -70,11 +83,36 @@ class SimulatedDevice:
         return kernel_infos(self.ptx(kernel.source), self.arch)[kernel.entry]
 
     def launch(self, launch: Launch) -> LaunchReport:
+        if self.mode == "profile":
+            return self._profile(launch)
         seed = {"seed": self.seed} if self.mode == "debug" else {}
         result = launch.kernel.handle.launch(
             launch.grid, launch.block, launch.args, shared_bytes=launch.shared_bytes, **seed
         )
         return LaunchReport(result.counters, result.findings)
+
+    def _profile(self, launch: Launch) -> LaunchReport:
+        assert self.machine is not None
+        info, threads = self.info(launch.kernel), math.prod(launch.block)
+        shared_bytes = (info.shared_bytes or 0) + launch.shared_bytes
+        result = launch.kernel.handle.launch(
+            launch.grid,
+            launch.block,
+            launch.args,
+            shared_bytes=launch.shared_bytes,
+            machine=self.machine(info, threads, shared_bytes),
+        )
+        profile = LaunchProfile(
+            launch.kernel.entry,
+            math.prod(launch.grid),
+            threads,
+            shared_bytes,
+            info,
+            result.counters,
+            result.memory,
+            result.opcodes,
+        )
+        return LaunchReport(result.counters, result.findings, (profile,))
 
     def synchronize(self) -> None:
         """Launches return when they are done."""

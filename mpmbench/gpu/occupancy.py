@@ -37,6 +37,12 @@ def occupancy(gpu: Gpu, threads: int, registers: int, shared_bytes: int) -> Occu
     return Occupancy(limits[limiter], limits[limiter] * warps, limiter)
 
 
+def shared_bytes_of_block(gpu: Gpu, shared_bytes: int) -> int:
+    """What one thread block takes of an SM's shared memory [bytes], rounding and the system's share included."""
+    reserved = int(gpu["shared_reserved_bytes_per_block"])
+    return _round_up(shared_bytes + reserved, int(gpu["shared_granularity_bytes"]))
+
+
 def _by_registers(gpu: Gpu, warps: int, registers: int) -> int:
     per_warp = _round_up(max(registers, 1) * WARP, REGISTER_UNIT)
     resident = int(gpu["registers_per_sm"]) // per_warp // WARP_UNIT * WARP_UNIT
@@ -44,10 +50,9 @@ def _by_registers(gpu: Gpu, warps: int, registers: int) -> int:
 
 
 def _by_shared(gpu: Gpu, shared_bytes: int) -> int:
-    reserved = int(gpu["shared_reserved_bytes_per_block"])
-    per_block = _round_up(shared_bytes + reserved, int(gpu["shared_granularity_bytes"]))
     if shared_bytes > gpu["shared_bytes_per_block"]:
         return 0
+    per_block = shared_bytes_of_block(gpu, shared_bytes)
     return int(gpu["shared_bytes_per_sm"]) // per_block if per_block else int(gpu["blocks_per_sm"])
 
 

@@ -17,6 +17,7 @@ from mpmbench.report.banks import BankPicture
 from mpmbench.report.modelled import GpuGroup
 from mpmbench.report.plots import Bars, Line, Lines, logspace, thin
 from mpmbench.report.profile import Card
+from mpmbench.report.scatter import Scatter
 from mpmbench.report.table import Group, Kind, Table
 from mpmbench.report.text import number, seconds_text
 
@@ -54,7 +55,7 @@ class Details:
 class Section:
     title: str
     tables: tuple[Table, ...] = ()
-    charts: tuple[Bars | Lines | BankPicture, ...] = ()
+    charts: tuple[Bars | Lines | BankPicture | Scatter, ...] = ()
     details: tuple[Details, ...] = ()
     intro: str = ""
     cards: tuple[Card, ...] = ()

@@ -12,6 +12,7 @@ from markupsafe import Markup, escape
 from mpmbench.report.banks import BankPicture
 from mpmbench.report.document import KINDS, Document
 from mpmbench.report.plots import Bars, Lines, svg
+from mpmbench.report.scatter import Scatter
 from mpmbench.report.speed_of_light import Roofline, SpeedOfLight
 from mpmbench.report.table import Column, Kind, Quantity, Table
 from mpmbench.report.text import LEFT, format_value
@@ -40,7 +41,7 @@ def anchor(title: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
 
-def _chart(chart: Bars | Lines | BankPicture | SpeedOfLight | Roofline) -> Markup:
+def _chart(chart: Bars | Lines | BankPicture | Scatter | SpeedOfLight | Roofline) -> Markup:
     return Markup(svg(chart))
 
 

@@ -17,6 +17,7 @@ from mpmbench.report.text import number
 
 if TYPE_CHECKING:
     from mpmbench.report.banks import BankPicture
+    from mpmbench.report.scatter import Scatter
     from mpmbench.report.speed_of_light import Roofline, SpeedOfLight
 
 INK = "#010101"
@@ -61,7 +62,7 @@ class Lines:
 
 
 @lru_cache(maxsize=256)
-def svg(chart: Bars | Lines | BankPicture | SpeedOfLight | Roofline) -> str:
+def svg(chart: Bars | Lines | BankPicture | Scatter | SpeedOfLight | Roofline) -> str:
     """An ``<svg>`` element. Kept, as a page that comes out too large is laid out again with less on it."""
     import matplotlib
 
@@ -85,10 +86,12 @@ def svg(chart: Bars | Lines | BankPicture | SpeedOfLight | Roofline) -> str:
             return _bars(chart)
         if isinstance(chart, Lines):
             return _lines(chart)
-        from mpmbench.report import banks, speed_of_light
+        from mpmbench.report import banks, scatter, speed_of_light
 
         if isinstance(chart, banks.BankPicture):
             return banks.draw(chart)
+        if isinstance(chart, scatter.Scatter):
+            return scatter.draw(chart)
         return speed_of_light.draw(chart)
 
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Container
 from dataclasses import dataclass, field
 
 from mpmbench.errors import InputError
-from mpmbench.simt import codegen_count, codegen_memory, codegen_rare, codegen_warp, scheduler
+from mpmbench.simt import codegen_count, codegen_memory, codegen_rare, codegen_trace, codegen_warp, scheduler
 from mpmbench.simt.address_forms import AddressForms
 from mpmbench.simt.codegen_arith import ELEMENT, EMITTERS, Refused, is_float_arithmetic
 from mpmbench.simt.codegen_ir import ELEMENT_BYTES, WARP, Writer, bits_of, element_of, integer_of
@@ -24,7 +24,7 @@ from mpmbench.simt.flow import Block, basic_blocks
 from mpmbench.simt.ptx import Address, Imm, Instruction, Kernel, NotReg, Operand, Reg, Special, Symbol
 from mpmbench.simt.scheduler import JOB
 
-MODES = ("run", "count", "debug")
+MODES = ("run", "count", "debug", "profile")
 
 _NOTHING = frozenset({"membar", "fence", "nanosleep", "prefetch", "prefetchu", "call", "pmevent", "griddepcontrol"})
 _UNIFORM_ROOTS = frozenset({"mov", "cvta", "cvt", "add", "sub", "mul", "mad", "shl"})
@@ -58,6 +58,7 @@ def refusal(item: Instruction) -> InputError:
 class _Generator:
     def __init__(self, kernel: Kernel, variables: dict[str, int], mode: str, lanes: int) -> None:
         self.kernel, self.variables, self.mode = kernel, variables, mode
+        self.counts, self.traces = mode in ("count", "profile"), mode == "profile"
         self.w = Writer(lanes)
         self.lanes = lanes
         self.segments = self._segments()
@@ -187,7 +188,8 @@ class _Generator:
         ]
         # Wrong lanes of a collective, traps and spent budgets end here.
         launch = scheduler.launch_text(self.context_bytes, self.hardware_ftz, self.mode == "debug")
-        text = "\n".join([*w.declarations.values(), *function, launch])
+        resume = scheduler.resume_text(self.hardware_ftz) if self.traces else ""
+        text = "\n".join([*w.declarations.values(), *function, launch, resume])
         widths = [site.element for site in self.sites if site.space in ("shared", "generic")]
         return KernelCode(
             self.kernel.name,
@@ -229,7 +231,7 @@ class _Generator:
         ]
 
     def resume_points(self) -> list[tuple[int, str]]:
-        """Where a warp goes on that has returned: the next segment's number, and a label."""
+        """Where a warp goes on that has returned: the number of a segment, and a label."""
         points = []
         for number, segment in enumerate(self.segments[:-1]):
             last = self.kernel.instructions[segment.stop - 1]
@@ -237,6 +239,8 @@ class _Generator:
                 points.append((number + 1, f"reduced{number}"))
             elif codegen_warp.is_barrier(last) or (self.mode == "debug" and self.yields_after(last)):
                 points.append((number + 1, f"run{number + 1}"))
+        if self.traces:
+            points += codegen_trace.loop_heads(self.segments, points)
         return points
 
     def yields_after(self, item: Instruction) -> bool:
@@ -278,7 +282,7 @@ class SegmentBody:
         self.g, self.number, self.segment = generator, number, segment
         self.w = generator.w
         self.hardware_ftz, self.explicit_ftz = generator.hardware_ftz, generator.explicit_ftz
-        self.counts, self.checks = generator.mode == "count", generator.mode == "debug"
+        self.counts, self.checks = generator.counts, generator.mode == "debug"
         self.observes = self.counts or self.checks
         instructions = generator.kernel.instructions[segment.start : segment.stop]
         self.forms = generator.forms.of_block(instructions, segment.start)
@@ -536,7 +540,11 @@ class SegmentBody:
             mask = warp_mask
             if mask_at is not None:
                 mask = self.w.value(f"and i32 {self.w.load('i32', mask_at, 4)}, {warp_mask}")
-            codegen_count.count_sites(self.g, sites, first, buffer, displacement, mask)
+            taken = codegen_count.count_sites(self.g, sites, first, buffer, displacement, mask)
+            if self.g.traces and sites[0].space in ("shared", "generic"):
+                codegen_trace.take_shared(self.g, sites, taken)
+            if self.g.traces and sites[0].space in ("global", "generic"):
+                codegen_trace.record_request(self.g, self.number, first, len(sites), buffer, displacement, mask)
 
         self.after_chunks.append(after)
 
@@ -665,8 +673,10 @@ class _Segment:
         w.label(f"run{n}")
         w.emit(f"%warp.{n} = load i32, ptr {self._pending(n)}, align 4")
         w.store("i32", "0", self._pending(n), 4)
-        if g.mode == "count" and not codegen_warp.gathers(self.last):
+        if g.counts and not codegen_warp.gathers(self.last):
             codegen_count.count_segment(g, n, f"%warp.{n}")
+        if g.traces and not codegen_warp.gathers(self.last):
+            codegen_trace.advance_clock(g, n)
         body = SegmentBody(g, n, self.segment)
         stop = self.segment.stop - 1 if _is_tail(self.last) else self.segment.stop
         self._branch_bits: str | None = None
@@ -772,8 +782,10 @@ class _Segment:
         left = w.value(f"and i32 {elsewhere}, {waited}")  # dead, or they would be missing
         w.store("i32", w.value(f"and i32 {waited}, {w.value(f'xor i32 {arrived}, -1')}"), waited_at, 4)
         self.fault(w.value(f"icmp ne i32 {left}, 0"), status)
-        if g.mode == "count":
+        if g.counts:
             codegen_count.count_segment(g, n, f"%warp.{n}")
+        if g.traces:
+            codegen_trace.advance_clock(g, n)
 
     def fault(self, condition: str, status: int) -> None:
         """Stop the launch with ``status`` if the condition holds; go on otherwise."""
@@ -833,7 +845,7 @@ class _Segment:
             return
         taken = self._guard_bits(mask)
         stay = w.value(f"xor i32 {taken}, {mask}")
-        if g.mode == "count":
+        if g.counts:
             codegen_count.count_branch(g, n, taken, stay)
         self._add_pending(target, taken)
         if n + 1 < count:
@@ -859,6 +871,8 @@ class _Segment:
         left = w.value(f"sub i64 {w.load('i64', address, 8)}, {cost}")
         w.store("i64", left, address, 8)
         self.fault(w.value(f"icmp slt i64 {left}, 0"), scheduler.FAULT_BUDGET)
+        if g.traces and self.last.root == "bra":
+            codegen_trace.yield_if_full(g, target)
 
     def _branch_by_index(self, mask: str) -> None:
         w, n, g = self.w, self.number, self.g

@@ -72,23 +72,23 @@ def count_table_branch(g: _Generator, number: int, ways: Sequence[str], mask: st
     _add(g, SEGMENT_WORDS * number + 2, w.value(f"zext i1 {w.value(f'xor i1 {together}, true')} to i64"))
 
 
-def count_sites(g: _Generator, sites: Sequence[Site], first: int, buffer: str, displacement: int, mask: str) -> None:
+def count_sites(g: _Generator, sites: Sequence[Site], first: int, buffer: str, displacement: int, mask: str) -> str:
     """One request of each of ``sites``, which access consecutive words; first: number of the first of them.
 
     buffer: addresses of the 32 lanes; in shared memory they may count from its start, which is aligned.
+    -> what one site's request takes of shared memory, as an i64: wavefronts, or rounds of an atomic.
     """
     w, site = g.w, sites[0]
     counters = w.at(_counters(g), 8 * (SEGMENT_WORDS * len(g.segments) + SITE_WORDS * first))
     if site.space == "generic":
-        _count_generic(g, sites, counters, buffer, displacement, mask)
-    else:
-        _count_part(w, sites, site.space, counters, buffer, displacement, mask)
+        return _count_generic(g, sites, counters, buffer, displacement, mask)
+    return _count_part(w, sites, site.space, counters, buffer, displacement, mask)
 
 
 def _count_part(
     w: Writer, sites: Sequence[Site], space: str, counters: str, buffer: str, displacement: int, mask: str
-) -> None:
-    """Call the function that counts a request in one space."""
+) -> str:
+    """Call the function that counts a request in one space, and give back its result."""
     site = sites[0]
     if space == "local":
         function = "count_local"
@@ -97,9 +97,9 @@ def _count_part(
     else:
         function = "count_atomics" if site.kind == "atomic" else "count_global"
     part = w.at(counters, 8 * PART_WORDS * PARTS.index(space))
-    w.declare(f"declare void @{function}(ptr, i64, i32, ptr, i64, i64)")
-    w.emit(
-        f"call void @{function}(ptr {buffer}, i64 {displacement}, i32 {mask}, ptr {part}, i64 {len(sites)}, "
+    w.declare(f"declare i64 @{function}(ptr, i64, i32, ptr, i64, i64)")
+    return w.value(
+        f"call i64 @{function}(ptr {buffer}, i64 {displacement}, i32 {mask}, ptr {part}, i64 {len(sites)}, "
         f"i64 {site.element})"
     )
 
@@ -110,7 +110,7 @@ def _group(width: int) -> int:
 
 def _count_generic(
     g: _Generator, sites: Sequence[Site], counters: str, buffer: str, displacement: int, mask: str
-) -> None:
+) -> str:
     """Sort the lanes by the window their addresses fall into; each part is a request of its own."""
     w = g.w
     lanes, w.lanes = w.lanes, WARP
@@ -119,22 +119,27 @@ def _count_generic(
         addresses = w.binary("add", "i64", addresses, w.splat_int("i64", displacement))
     shared, local = g.job_field("shared"), g.job_field("local")
     sizes = g.job_field("shared_bytes"), w.value(f"sub i64 {g.job_field('local_end')}, {local}")
-    rest = mask
+    rest, in_shared = mask, "0"
     for space, first, size in (("shared", shared, sizes[0]), ("local", local, sizes[1])):
         distance = w.binary("sub", "i64", addresses, w.splat("i64", first))
         inside = w.compare("icmp ult", "i64", distance, w.splat("i64", size))
         bits = w.value(f"and i32 {w.value(f'bitcast <32 x i1> {inside} to i32')}, {mask}")
-        _count_part(w, sites, space, counters, buffer, displacement, bits)
+        taken = _count_part(w, sites, space, counters, buffer, displacement, bits)
+        in_shared = taken if space == "shared" else in_shared
         rest = w.value(f"and i32 {rest}, {w.value(f'xor i32 {bits}, -1')}")
     _count_part(w, sites, "global", counters, buffer, displacement, rest)
     w.lanes = lanes
+    return in_shared
 
 
 # --- the functions, a module of their own -------------------------------------------------------------------------
 
 
 def support_text() -> str:
-    """LLVM text of the counting functions: ``(addresses, displacement, mask, counters, sites, element bytes)``."""
+    """LLVM text of the counting functions: ``(addresses, displacement, mask, counters, sites, element bytes)``.
+
+    They return what a site's request takes of shared memory: wavefronts, or rounds of an atomic; 0 elsewhere.
+    """
     functions: list[_Function] = [
         _global_function("count_global", atomic=False),
         _global_function("count_atomics", atomic=True),
@@ -151,6 +156,7 @@ class _Function:
 
     def __init__(self, name: str) -> None:
         self.name = name
+        self.result = "0"
         self.w = Writer(WARP)
         w = self.w
         w.declare("declare i32 @llvm.ctpop.i32(i32)")
@@ -187,11 +193,13 @@ class _Function:
 
     def text(self) -> str:
         w = self.w
+        last = _last_label_of(w)
         w.emit("br label %out")
         w.label("out")
-        w.emit("ret void")
+        w.emit(f"%result = phi i64 [ 0, %entry ], [ {self.result}, %{last} ]")
+        w.emit("ret i64 %result")
         parameters = "ptr %addresses, i64 %at, i32 %mask, ptr %counters, i64 %sites, i64 %element"
-        head = f'define void @{self.name}({parameters}) "prefer-vector-width"="512" "min-legal-vector-width"="512" {{'
+        head = f'define i64 @{self.name}({parameters}) "prefer-vector-width"="512" "min-legal-vector-width"="512" {{'
         return "\n".join([head, "entry:", *w.allocas, *w.lines, "}"])
 
 
@@ -328,7 +336,7 @@ def _shared_atomics_function() -> _Function:
     counts = w.select("i32", f.lanes(), _multiplicity(f, keys), w.splat_int("i32", 0))
     w.declare("declare i32 @llvm.vector.reduce.umax.v32i32(<32 x i32>)")
     largest = w.value(f"call i32 @llvm.vector.reduce.umax.v32i32(<32 x i32> {counts})")
-    wide = w.value(f"zext i32 {largest} to i64")
+    f.result = wide = w.value(f"zext i32 {largest} to i64")
     lanes = f.count_bits("%mask")
     came_from = _last_label_of(w)
     w.emit("br label %copy")
@@ -382,7 +390,8 @@ def _shared_function(width: int) -> _Function:
     total = w.value(f"call i32 @llvm.vector.reduce.add.v32i32(<32 x i32> {kept})")
     f.add(0, "1")
     f.add(1, f.count_bits("%mask"))
-    f.add(2, w.value(f"zext i32 {total} to i64"))
+    f.result = w.value(f"zext i32 {total} to i64")
+    f.add(2, f.result)
     return f
 
 

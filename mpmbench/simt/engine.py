@@ -3,9 +3,10 @@
     module = compile_ptx(ptx, mode="count")
     result = module.kernel("saxpy").launch((blocks, 1, 1), (128, 1, 1), (x, y, np.float32(2), np.int32(n)))
 
-Three modes share one code generator and give the same output bits: ``run`` (results only), ``count`` (and exact
-counters) and ``debug`` (checks memory and barriers, runs warps in a seeded random order, so that atomic adds of
-floats may round differently).
+Four modes share one code generator: ``run`` (results only), ``count`` (and exact counters), ``debug`` (checks memory
+and barriers, runs warps in a seeded random order) and ``profile`` (counts too, runs the resident warps of a given
+machine interleaved, with its caches and DRAM). Debug and profile order warps differently from the other two, so that
+atomic adds of floats may round differently.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from __future__ import annotations
 import ctypes
 import functools
 import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,8 @@ from mpmbench.simt import cache, codegen_count, native, ptx, scheduler
 from mpmbench.simt.codegen import MODES, KernelCode, generate
 from mpmbench.simt.codegen_memory import SINK_BYTES, SINK_REACH, Site
 from mpmbench.simt.counters import Counters, Finding, SourceLine
-from mpmbench.simt.tally import counters_from
+from mpmbench.simt.machine import Machine, MemoryCounters
+from mpmbench.simt.tally import counters_from, opcodes_from
 
 __all__ = ["DEFAULT_BUDGET", "Kernel", "LaunchResult", "Module", "compile_ptx"]
 
@@ -37,16 +39,22 @@ _MAX_SHARED = 227 * 1024  # of the largest GPU (Hopper)
 
 @dataclass(frozen=True)
 class LaunchResult:
-    """counters: in mode ``count``; findings: defects seen, in any mode."""
+    """counters: in modes ``count`` and ``profile``; findings: defects seen, in any mode. memory: in mode ``profile``.
+
+    opcodes: how often warps executed each PTX opcode with each integer literal (None: without), where counters are
+    kept.
+    """
 
     counters: Counters | None
     findings: tuple[Finding, ...]
+    memory: MemoryCounters | None = None
+    opcodes: Mapping[tuple[str, int | None], int] = field(default_factory=dict)
 
 
 def compile_ptx(text: str, mode: str = "run", lane_width: int = 16) -> Module:
     """A module whose kernels compile at their first use, or come from the disk cache.
 
-    mode: run, count or debug. lane_width: lanes that compiled code handles at a time (8, 16 or 32); results of
+    mode: run, count, debug or profile. lane_width: lanes that compiled code handles at a time (8, 16 or 32); results of
     race-free programs do not depend on it.
     """
     if mode not in MODES:
@@ -98,6 +106,7 @@ class _Description:
     shared_granule: int
     lines: list[tuple[str, int] | None]
     opcodes: list[str]
+    literals: list[int | None]  # last integer literal among the operands of each instruction
     guarded: list[bool]
 
 
@@ -113,7 +122,7 @@ class Kernel:
             stored = _pack(*self._compile())
             cache.store("kernel", key, stored)
         self.facts, machine_code = _unpack(stored)
-        if mode == "count":
+        if mode in ("count", "profile"):
             _load_support()
         self._code = native.LoadedCode(machine_code)
         self._launch = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p)(self._code.address("launch"))
@@ -136,13 +145,14 @@ class Kernel:
         seed: int | None = None,
         budget: int | None = None,
         allocations: Sequence[np.ndarray] = (),
+        machine: Machine | None = None,
     ) -> LaunchResult:
         """Run the kernel.
 
         grid, block: thread blocks and threads per axis (x, y, z). args: C-contiguous NumPy arrays, which are the
         memory itself, NumPy scalars, and structured NumPy scalars passed by value. shared_bytes: dynamic shared
         memory. seed: of the warp order in mode debug. budget: warp instructions that loops may repeat. allocations:
-        further arrays that pointers inside structures may point to.
+        further arrays that pointers inside structures may point to. machine: what mode profile models.
         """
         job = _Job(self.module, self.facts, _three(grid, "grid"), _three(block, "block"), shared_bytes, self.name)
         job.set_arguments(args)
@@ -152,14 +162,35 @@ class Kernel:
             from mpmbench.simt.checks import Checker
 
             checker = Checker(self.facts, job, [*args, *allocations], 0 if seed is None else seed)
-        status = self._launch(job.address) if job.threads else 0
+        memory = None
+        if self.module.mode == "profile" and job.threads:
+            status, memory = self._profile(job, machine, [*args, *allocations])
+        else:
+            status = self._launch(job.address) if job.threads else 0
         findings = _faults(self.name, self.facts, job, status)
         if checker is not None:
             findings += checker.findings(self.name)
-        counters = None
-        if self.module.mode == "count":
-            counters = counters_from(self.facts, job.counters)
-        return LaunchResult(counters, tuple(findings))
+        if self.module.mode not in ("count", "profile"):
+            return LaunchResult(None, tuple(findings))
+        counters = counters_from(self.facts, job.counters)
+        return LaunchResult(counters, tuple(findings), memory, opcodes_from(self.facts, job.counters))
+
+    def _profile(self, job: _Job, machine: Machine | None, arguments: Sequence[Any]) -> tuple[int, MemoryCounters]:
+        """Run all thread blocks on a modelled machine."""
+        from mpmbench.simt.memory_system import MemorySystem
+        from mpmbench.simt.scheduler import ISSUE_UNITS
+        from mpmbench.simt.timing import cas_trip_cycles, timing_tables
+
+        if machine is None:
+            raise InputError(f"{self.name}: mode profile needs a machine to model")
+        kernel = self.module.parsed.kernels[self.name]
+        tables = timing_tables(kernel, self.facts.segments, self.facts.sites, machine)
+        job.set("segments", tables.segments.ctypes.data)
+        job.set("cas_trip", cas_trip_cycles(machine))
+        job.set("cas_issue", round(machine.cas_issue_cycles * ISSUE_UNITS))
+        blocks = job.get("grid_x") * job.get("grid_y") * job.get("grid_z")
+        arrays = [a for a in arguments if isinstance(a, np.ndarray) and a.ndim > 0]
+        return MemorySystem(machine, self.facts, tables).run(self._code.address("resume"), job, blocks, arrays)
 
 
 # --- one launch ---------------------------------------------------------------------------------------------------
@@ -319,6 +350,7 @@ def _describe(module: ptx.Module, kernel: ptx.Kernel, code: KernelCode) -> _Desc
         shared_granule=code.shared_granule,
         lines=code.lines,
         opcodes=[item.opcode for item in kernel.instructions],
+        literals=[item.literal for item in kernel.instructions],
         guarded=[item.guard is not None for item in kernel.instructions],
     )
 

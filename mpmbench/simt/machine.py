@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 
 from mpmbench.simt.counters import SourceLine
+from mpmbench.simt.ptx import Instruction
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,10 @@ class Machine:
     l2_latency: int
     dram_latency: int
     barrier_latency: int
+    block_start: int = 0  # cycles between the end of a thread block and the start of the next one in its place
+    # What a warp takes of its SM's issue slots for a PTX instruction [cycles]; a quarter if four warps issue at once.
+    issue_cycles: Callable[[Instruction], float] = lambda instruction: 0.25
+    cas_issue_cycles: float = 1.25  # the same for one round of a float atomic in shared memory
 
 
 @dataclass
@@ -64,5 +70,8 @@ class MemoryCounters:
     hot_address: int = 0  # atomics on the word that got most of them
     latency_cycles: int = 0  # end of the last warp if nothing but latencies and barriers took time
     warp_cycles: int = 0  # the same, summed over warps
-    barrier_wait_cycles: int = 0  # of these, cycles that warps spent waiting for others at block barriers
+    barrier_wait_cycles: int = 0  # of these, cycles that warps spent waiting for others at block barriers,
+    l1_wait_cycles: int = 0  # for values from L1,
+    l2_wait_cycles: int = 0  # from L2
+    dram_wait_cycles: int = 0  # and from DRAM
     resident_warps: int = 0  # most warps that were resident at a time, whole GPU

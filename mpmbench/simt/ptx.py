@@ -109,6 +109,12 @@ class Instruction:
     def modifiers(self) -> tuple[str, ...]:
         return tuple(self.opcode.split(".")[1:])
 
+    @property
+    def literal(self) -> int | None:
+        """The last integer literal among the operands."""
+        found = [operand.value for operand in self.srcs if isinstance(operand, Imm) and not operand.float_bits]
+        return found[-1] if found else None
+
     def reads(self) -> Iterator[Reg]:
         """Registers read, guard included. A guarded write keeps the old value of dead lanes: see flow.py."""
         if self.guard is not None:

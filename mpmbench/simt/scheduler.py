@@ -38,6 +38,9 @@ JOB_FIELDS = (
     "order",  # scratch: ready warps (debug)
     "stranded",  # thread blocks in which some warps ended while others waited at a barrier (debug)
     "stranded_segment",
+    "segments",  # address of a table: cycles and issue slots of each segment (profile)
+    "cas_trip",  # cycles of one round of a float atomic in shared memory,
+    "cas_issue",  # and what it takes of the issue slots (profile)
     # Votes of reducing barriers (lanes that hold the predicate, lanes that arrived), three barriers in rotation: while
     # one is read and the next is filled, the third is cleared.
     "votes_0",
@@ -63,7 +66,14 @@ CONTEXT_WAITED = 48  # i32: lanes that others have waited for and that have not 
 CONTEXT_STUCK = 52  # i32: status to end with if those never come,
 CONTEXT_STUCK_SEGMENT = 56  # i32: and the segment where the others wait
 CONTEXT_TID = 64  # 3 x 32 x i32
-CONTEXT_SLOTS = CONTEXT_TID + 3 * 128  # what the code generator lays out: pending masks, registers
+CONTEXT_CLOCK = CONTEXT_TID + 3 * 128  # i64: cycles that the warp's instructions took, waits for memory apart (profile)
+CONTEXT_TRACE = CONTEXT_CLOCK + 8  # i64: where its next request is recorded (profile),
+CONTEXT_TRACE_LIMIT = CONTEXT_TRACE + 8  # i64: and from where on it should stop at the next backward branch
+CONTEXT_ISSUE = (
+    CONTEXT_TRACE_LIMIT + 8
+)  # i64: what its instructions took of the SM's issue slots, in ISSUE_UNITS (profile)
+CONTEXT_SHARED = CONTEXT_ISSUE + 8  # i64: cycles of the shared-memory pipe that it took (profile)
+CONTEXT_SLOTS = CONTEXT_CLOCK + 64  # what the code generator lays out: pending masks, registers
 
 READY, WAITING, ENDED = 0, 1, 2
 
@@ -76,6 +86,8 @@ FAULT_BUDGET = 5
 FAULT_TRAP = 6
 FAULT_MASK = 7
 FIRST_FAULT = FAULT_DIVERGENT_BARRIER
+
+ISSUE_UNITS = 1024  # parts of a cycle, fixed point
 
 POISON = 0xFF  # 0xFFFFFFFF is a NaN, as a number it is -1
 
@@ -96,18 +108,7 @@ def launch_text(context_bytes: int, hardware_ftz: bool, debug: bool) -> str:
     fields = {name: str(offset) for name, offset in JOB.items()}
     for name, value in fields.items():
         body = body.replace(f"@{name}@", value)
-    # FTZ (bit 15) and DAZ (bit 6) of MXCSR, for the whole launch and put back after it.
-    enter = leave = ""
-    if hardware_ftz:
-        enter = """  %mode.saved = alloca i32
-  %mode.new = alloca i32
-  call void @llvm.x86.sse.stmxcsr(ptr %mode.saved)
-  %mode = load i32, ptr %mode.saved
-  %mode.flush = or i32 %mode, 32832
-  store i32 %mode.flush, ptr %mode.new
-  call void @llvm.x86.sse.ldmxcsr(ptr %mode.new)
-"""
-        leave = "  call void @llvm.x86.sse.ldmxcsr(ptr %mode.saved)\n"
+    enter, leave = _flushing_mode(hardware_ftz)  # for the whole launch
     poison = _POISON_BLOCK if debug else "  br label %round\n"
     return f"""
 define i32 @launch(ptr noalias %job) {{
@@ -190,6 +191,33 @@ declare void @llvm.x86.sse.stmxcsr(ptr)
 declare void @llvm.x86.sse.ldmxcsr(ptr)
 declare void @llvm.memset.p0.i64(ptr, i8, i64, i1)
 """
+
+
+def resume_text(hardware_ftz: bool) -> str:
+    """LLVM text of ``i32 @resume(ptr context, ptr job)``: one warp until it stops, for a scheduler outside."""
+    enter, leave = _flushing_mode(hardware_ftz)
+    return f"""
+define i32 @resume(ptr noalias align 64 %context, ptr noalias %job) {{
+entry:
+{enter}  %status = call i32 @warp(ptr %context, ptr %job)
+{leave}  ret i32 %status
+}}
+"""
+
+
+def _flushing_mode(hardware_ftz: bool) -> tuple[str, str]:
+    """FTZ (bit 15) and DAZ (bit 6) of MXCSR: code that sets them, and that puts back what was there."""
+    if not hardware_ftz:
+        return "", ""
+    enter = """  %mode.saved = alloca i32
+  %mode.new = alloca i32
+  call void @llvm.x86.sse.stmxcsr(ptr %mode.saved)
+  %mode = load i32, ptr %mode.saved
+  %mode.flush = or i32 %mode, 32832
+  store i32 %mode.flush, ptr %mode.new
+  call void @llvm.x86.sse.ldmxcsr(ptr %mode.new)
+"""
+    return enter, "  call void @llvm.x86.sse.ldmxcsr(ptr %mode.saved)\n"
 
 
 _POISON_BLOCK = f"""  %shared.start = inttoptr i64 %shared to ptr

@@ -67,3 +67,14 @@ def counters_from(facts: _Description, words: np.ndarray) -> Counters:
     for entry in counters.lines.values():
         counters.total += entry
     return counters
+
+
+def opcodes_from(facts: _Description, words: np.ndarray) -> dict[tuple[str, int | None], int]:
+    """Executions by a warp of each PTX opcode with each integer literal. words: as above."""
+    executions: dict[tuple[str, int | None], int] = {}
+    segments = words[: SEGMENT_WORDS * len(facts.segments)].reshape(-1, SEGMENT_WORDS)[:, 0].tolist()
+    for (start, stop), times in zip(facts.segments, segments, strict=True):
+        if times:
+            for key in zip(facts.opcodes[start:stop], facts.literals[start:stop], strict=True):
+                executions[key] = executions.get(key, 0) + times
+    return executions
