@@ -22,10 +22,10 @@ N = 1_000_000
 DATASET = DatasetSummary("uniform_cube", {"particles_per_cell": 4}, 1, N, Grid((128,) * 3, 1 / 128), "ab" * 32)
 GLOBAL_AXES = {
     "dtype": "float32", "spline": "cubic", "payload": "pic", "layout": "soa", "particle_order": "given",
-    "writing": "hoisted",
+    "writing": "hoisted", "block_shape": (8, 4, 4),
 }  # fmt: skip
 BLOCK_AXES = {
-    **GLOBAL_AXES, "particle_order": "deep", "block_shape": (8, 4, 4), "batching": 1, "blocks": "active",
+    **GLOBAL_AXES, "particle_order": "deep", "batching": 1, "blocks": "active",
 }  # fmt: skip
 TITLES = {
     "gtx970": "NVIDIA GeForce GTX 970",

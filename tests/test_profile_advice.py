@@ -50,6 +50,8 @@ def test_every_bound_has_advice_that_always_applies():
         ("atomics", {"variant": "p2g_block_sync"}, "a larger block_shape"),
         ("issue", {"axes": {"writing": "literal"}}, "writing=hoisted"),
         ("issue", {"tally": Tally(warp_inst=100, lane_inst=1_000)}, "only 10 of 32 lanes"),
+        ("issue", {"variant": "p2g_block_atomic"}, "loops, here of 3.25 trips on average"),
+        ("issue", {"tally": Tally(warp_inst=100, lane_inst=3200, satom_req=5, satom_iter=5)}, "only fewer instr"),
         ("issue", {}, "only fewer instructions"),
         ("shared", {"variant": "p2g_block_atomic"}, "loops, here of 3.25 trips on average"),
         ("shared", {"variant": "p2g_block_sync"}, "only fewer shared accesses"),

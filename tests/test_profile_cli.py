@@ -25,9 +25,11 @@ def modelled(monkeypatch):
     """What the engine side is asked for, and the records that it gives."""
     asked: dict = {"records": strategies()}
 
-    def made_up(cases, gpus, progress):
+    def made_up(cases, gpus, progress, keep, known):
         asked.update(cases=cases, gpus=gpus)
         progress("p2g_block_sync", 1, 1)
+        for made in asked["records"]:
+            keep(made)
         return asked["records"]
 
     monkeypatch.setattr(engine, "profile_cases", made_up)

@@ -19,6 +19,8 @@ LANES = 32
 
 NEAR_FLOOR = 1.5  # DRAM traffic over the compulsory: below it, no strategy can save much
 FEW_LANES = 20  # of 32, on average
+ROUND = 5  # machine instructions of one trip of a compare-and-swap loop: load, add, swap, compare, branch
+MANY_ROUNDS = 0.3  # of the issue slots
 MANY_WAITS = 0.3  # of the life of a warp
 MANY_WAVEFRONTS = 2.0  # per shared access
 HOT = 0.01  # of all atomics, on one word
@@ -47,7 +49,8 @@ class Facts:
 
     @property
     def per_block(self) -> bool:
-        return "block_shape" in self.record.axes
+        """Whether a thread block works on a block of the grid; block_shape alone may only shape the sort."""
+        return "blocks" in self.record.axes
 
     @property
     def global_transfer(self) -> bool:
@@ -78,6 +81,12 @@ class Facts:
     def trips(self) -> float:
         """Of the compare-and-swap loop of a shared atomic, on average."""
         return self.tally.satom_iter / self.tally.satom_req if self.tally.satom_req else 0.0
+
+    @property
+    def looping(self) -> float:
+        """Share of the issue slots that those loops take."""
+        rounds = ROUND * self.tally.satom_iter
+        return rounds / (self.tally.warp_inst + rounds) if rounds else 0.0
 
     @property
     def waiting(self) -> float:
@@ -118,6 +127,13 @@ def _always(text: str) -> Rule:
     return Rule(lambda f: True, lambda f: text)
 
 
+def _loops(f: Facts) -> str:
+    return (
+        f"shared float atomics are loops, here of {number(f.trips)} trips on average: adding up more particles in "
+        "registers first (batching), or barriers in their place (p2g_block_sync), would help"
+    )
+
+
 _SORT = Rule(
     lambda f: f.record.is_transfer and f.unsorted,
     lambda f: "sorting the particles (particle_order=deep) would bring the accesses of a warp together",
@@ -138,6 +154,7 @@ RULES: dict[str, tuple[Rule, ...]] = {
             lambda f: f.record.axes.get("writing") == "literal" and f.record.default_axes.get("writing") == "hoisted",
             lambda f: "writing=hoisted would compute the weights of a particle once and not at every node",
         ),
+        Rule(lambda f: f.scatters and f.looping > MANY_ROUNDS, _loops),
         Rule(
             lambda f: f.lanes < FEW_LANES,
             lambda f: (
@@ -148,13 +165,7 @@ RULES: dict[str, tuple[Rule, ...]] = {
         _always("only fewer instructions would help, not less memory traffic"),
     ),
     "shared": (
-        Rule(
-            lambda f: f.scatters and f.tally.satom_req > 0,
-            lambda f: (
-                f"shared float atomics are loops, here of {number(f.trips)} trips on average: adding up more "
-                "particles in registers first (batching), or barriers in their place (p2g_block_sync), would help"
-            ),
-        ),
+        Rule(lambda f: f.scatters and f.tally.satom_req > 0, _loops),
         Rule(
             lambda f: f.wavefronts > MANY_WAVEFRONTS,
             lambda f: (
@@ -213,7 +224,10 @@ RULES: dict[str, tuple[Rule, ...]] = {
         _always("fewer global atomics would help"),
     ),
     "latency": (
-        Rule(lambda f: f.sparse, lambda f: "there are too few thread blocks to fill the GPU: more work per launch"),
+        Rule(
+            lambda f: f.sparse,
+            lambda f: "there are too few thread blocks to fill the GPU: more work per launch would help",
+        ),
         Rule(
             lambda f: f.waiting > MANY_WAITS,
             lambda f: (

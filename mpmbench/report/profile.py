@@ -77,13 +77,12 @@ def overview(g: GpuGroup) -> Table:
 
 def metrics(g: GpuGroup) -> Table | None:
     """The metrics of thesis table 2, in its words."""
-    names = dict.fromkeys(name for r in g.runs for name in g.profile(r).metrics)
-    if not names:
+    known = [name for name in METRICS if any(name in g.profile(r).metrics for r in g.runs)]
+    if not known:
         return None
-    known = [name for name in METRICS if name in names] + [name for name in names if name not in METRICS]
     sources = _who(g)
     for name in known:
-        title, explain = METRICS.get(name, (name.replace("_", " "), ""))
+        title, explain = METRICS[name]
         sources.append((_modelled(title, Quantity.NUMBER, None, explain), _metric(name)))
     held: tuple[tuple[str, Quantity, str, Callable[[Record, Profile], Any]], ...] = (
         ("warps that fit", Quantity.COUNT, "per SM, by registers, shared memory, warps and blocks",

@@ -134,7 +134,7 @@ def _roofline(chart: Roofline) -> str:
     for i, (level, knee) in enumerate(zip(chart.levels, knees, strict=True)):
         axes.plot((left, knee), (left * level.rate / GIGA, peak), color=SERIES[i], linewidth=1.4)
         axes.plot(
-            level.intensity, achieved, marker=MARKERS[i], color=SERIES[i], markersize=7, linestyle="none",
+            level.intensity, achieved, marker=MARKERS[i], color=SERIES[i], markersize=9 - i, linestyle="none",
             label=f"{level.name}: {number(level.intensity)} per transaction, limit {number(level.rate / GIGA)}·10⁹/s",
         )  # fmt: skip
         axes.plot((level.intensity,) * 2, (chart.low / GIGA, chart.high / GIGA), color=SERIES[i], linewidth=1.2)
