@@ -129,8 +129,8 @@ def _always(text: str) -> Rule:
 
 def _loops(f: Facts) -> str:
     return (
-        f"shared float atomics are loops, here of {number(f.trips)} trip{'' if f.trips == 1 else 's'} on average: adding "
-        "up more particles in registers first (batching), or barriers in their place (p2g_block_sync), would help"
+        f"shared float atomics are loops, here of {number(f.trips)} trip{'' if f.trips == 1 else 's'} on average: "
+        "adding up more particles in registers first (batching), or barriers instead (p2g_block_sync), would help"
     )
 
 
