@@ -52,23 +52,17 @@ def machine_of(gpu: Gpu, blocks_per_sm: int, shared_bytes: int = 0) -> Machine:
         barrier_latency=int(gpu["barrier_latency"]),
         block_start=int(gpu["block_start_cycles"]),
         issue_cycles=partial(_issue_cycles, gpu),
-        cas_issue_cycles=cas_trip_slots(gpu) / gpu["issue_efficiency"],
+        cas_issue_cycles=sum(CAS_TRIP.values()) * slot_cycles(gpu),
     )
 
 
 def _issue_cycles(gpu: Gpu, instruction: Instruction) -> float:
-    kind, count = instruction_weight(instruction, gpu.arch)
-    return count * slot_cycles(gpu, kind) / gpu["issue_efficiency"]
+    return instruction_weight(instruction, gpu.arch)[1] * slot_cycles(gpu)
 
 
-def slot_cycles(gpu: Gpu, kind: str) -> float:
-    """Cycles of an SM that one machine instruction of a class takes at full issue rate."""
-    return 1 / min(gpu["schedulers_per_sm"], gpu.get(f"rate_{kind}") or gpu["schedulers_per_sm"])
-
-
-def cas_trip_slots(gpu: Gpu) -> float:
-    """The same for one round of a float atomic in shared memory."""
-    return sum(count * slot_cycles(gpu, kind) for kind, count in CAS_TRIP.items())
+def slot_cycles(gpu: Gpu) -> float:
+    """Cycles of an SM that one machine instruction takes, given the share of issue slots that busy kernels use."""
+    return 1 / (gpu["schedulers_per_sm"] * gpu["issue_efficiency"])
 
 
 def machine_for(gpu: Gpu) -> Callable[[KernelInfo, int, int], Machine]:

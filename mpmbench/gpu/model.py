@@ -3,17 +3,19 @@
 The template is Zhang and Owens (HPCA 2011), throughput of the busiest unit, with a term for DRAM row activations and a
 latency bound after Volkov (2016). With counts per launch, N SMs that have work, and f the SM clock:
 
-    issue        sum over classes of machine instructions / (eta min(4, rate)) / (N f)
+    issue        machine instructions / (4 eta) or, if that is more, those of one class / its rate; / (N f)
     shared       (wavefronts + 3 rounds of float atomics + global requests) / (N f)
     l1           bytes that loads ask for / bytes per cycle / (N f)
     l2           32 B x sectors / L2 bandwidth
     dram         32 B x sectors read and written / achieved DRAM bandwidth
     activations  row activations / their rate
     atomics      the larger of lanes / their rate, and atomics on one word at one per cycle
-    latency      end of the last warp if nothing but latencies and barriers took time
+    latency      end of the last warp if idle latencies, barriers and the SMs' own pipes were all that took time
 
-The time is the launch overhead plus the largest term. Its range: from 1/1.25 of the term to 1.25 times it or, where
-that is more, to the two largest terms one after the other, as if they did not overlap at all.
+The time is the launch overhead plus the largest term. The latency term holds the work of the SMs' pipes as it comes
+from barrier to barrier, so it is a little longer than those: it is named as what binds only where it exceeds every
+other term by a tenth. The range goes from 1/1.25 of the term to 1.25 times it or, where that is more, to the longest
+term of the SMs and the longest of the memory one after the other, as if they did not overlap at all.
 """
 
 from __future__ import annotations
@@ -24,11 +26,14 @@ from functools import cache
 
 from mpmbench.device import LaunchProfile
 from mpmbench.gpu import Gpu, get_gpu
-from mpmbench.gpu.machine import cas_trip_slots, slot_cycles
+from mpmbench.gpu.machine import slot_cycles
 from mpmbench.gpu.modelled import TERMS, ModelledTime
-from mpmbench.gpu.sass import is_shared_float_add, weight
+from mpmbench.gpu.sass import CAS_TRIP, is_shared_float_add, weight
 
 SECTOR_BYTES = 32
+SM_TERMS = ("issue", "shared", "l1", "latency")
+MEMORY_TERMS = ("l2", "dram", "activations", "atomics")
+CLEARLY = 1.1  # by how much the latency term must exceed the others to be named
 ERROR = 1.25  # what models of this kind reach on codes that they were not made for: 15 to 25 %
 ATOMIC_RANGE = (0.5, 4.0)  # of one addition per cycle and L2 slice, where no rate is known
 ACTIVATION_RANGE = (0.5, 2.0)  # of the calibrated rate per bank, where no rate is known
@@ -81,20 +86,32 @@ def busy_sms(gpu: Gpu, blocks: int) -> float:
     return blocks / -(-blocks // sms) if blocks else 1.0
 
 
-def issue_slots(gpu: Gpu, launch: LaunchProfile) -> float:
-    """Cycles of one SM that all machine instructions of a launch take at full issue rate."""
-    slots = 0.0
+def instruction_counts(gpu: Gpu, launch: LaunchProfile) -> dict[str, float]:
+    """Machine instructions of a launch by class, warp by warp."""
+    counts: dict[str, float] = {}
     satomics = float_satomics = 0
     for (opcode, literal), times in launch.opcodes.items():
-        kind, count = weight(opcode, gpu.arch, literal)
-        slots += times * count * slot_cycles(gpu, kind)
+        kind, each = weight(opcode, gpu.arch, literal)
+        counts[kind] = counts.get(kind, 0.0) + times * each
         if opcode.startswith(("atom.", "red.")) and ".shared" in opcode:
             satomics += times
             float_satomics += times * is_shared_float_add(opcode)
     if satomics:
         trips = launch.counters.total.satom_iter * float_satomics / satomics
-        slots += trips * cas_trip_slots(gpu)
-    return slots
+        for kind, each in CAS_TRIP.items():
+            counts[kind] = counts.get(kind, 0.0) + trips * each
+    return counts
+
+
+def issue_cycles(gpu: Gpu, launch: LaunchProfile) -> float:
+    """Cycles of one SM for all instructions: its issue slots, or the unit of one class where that takes longer.
+
+    Units of different classes work side by side; what they share is the issue slots, of which busy kernels fill the
+    share ``issue_efficiency``.
+    """
+    counts = instruction_counts(gpu, launch)
+    units = (count / rate for kind, count in counts.items() if (rate := gpu.get(f"rate_{kind}")))
+    return max(sum(counts.values()) * slot_cycles(gpu), *units, 0.0)
 
 
 def terms_of(gpu: Gpu, launch: LaunchProfile, rates: Rates) -> dict[str, float]:
@@ -104,7 +121,7 @@ def terms_of(gpu: Gpu, launch: LaunchProfile, rates: Rates) -> dict[str, float]:
     sm_cycles = busy_sms(gpu, launch.blocks) * clock
     requests = tally.gld_req + tally.gst_req + tally.gatom_req
     return {
-        "issue": issue_slots(gpu, launch) / gpu["issue_efficiency"] / sm_cycles,
+        "issue": issue_cycles(gpu, launch) / sm_cycles,
         "shared": (tally.shm_wavefronts + CAS_WAVEFRONTS * tally.satom_iter + requests) / sm_cycles,
         "l1": memory.l1_request_bytes / gpu["l1_bytes_per_clk"] / sm_cycles,
         "l2": SECTOR_BYTES * memory.l2_sectors / gpu["l2_bandwidth"],
@@ -117,27 +134,32 @@ def terms_of(gpu: Gpu, launch: LaunchProfile, rates: Rates) -> dict[str, float]:
 
 def model_launch(gpu: Gpu, launch: LaunchProfile, rates: Rates) -> ModelledTime:
     """Predicted time of one launch."""
-    terms, overhead = terms_of(gpu, launch, rates), gpu["launch_overhead"]
-    bound = max(TERMS, key=lambda name: terms[name])
-    first = terms[bound]
-    fast = terms_of(gpu, launch, _scaled(rates, 1))
-    slow = terms_of(gpu, launch, _scaled(rates, 0))
-    slowest, next_slowest = sorted(slow.values(), reverse=True)[:2]
-    uncertain = max(fast.values()) < first or slowest > first
+    overhead = gpu["launch_overhead"]
+    slow, terms, fast = (terms_of(gpu, launch, _scaled(rates, end)) for end in (0, None, 1))
+    first, fastest, slowest = (max(found.values()) for found in (terms, fast, slow))
+    apart = max(slow[name] for name in SM_TERMS) + max(slow[name] for name in MEMORY_TERMS)
+    uncertain = fastest < first or slowest > first
     return ModelledTime(
         gpu.name,
         overhead + first,
-        overhead + max(fast.values()) / ERROR,
-        overhead + max(ERROR * slowest, slowest + next_slowest),
-        bound,
+        overhead + fastest / ERROR,
+        overhead + max(ERROR * slowest, apart),
+        _bound(terms),
         {"launch": overhead, **terms},
         not uncertain,
         rates.uncalibrated if uncertain else "",
     )
 
 
-def _scaled(rates: Rates, end: int) -> Rates:
-    """Rates at the slow (0) or fast (1) end of their ranges."""
+def _bound(terms: Mapping[str, float]) -> str:
+    longest = max((name for name in TERMS if name != "latency"), key=lambda name: terms[name])
+    return "latency" if terms["latency"] > CLEARLY * terms[longest] else longest
+
+
+def _scaled(rates: Rates, end: int | None) -> Rates:
+    """Rates at the slow (0) or fast (1) end of their ranges, or as they are."""
+    if end is None:
+        return rates
     return replace(
         rates,
         atomics=rates.atomics * rates.atomics_range[end],
@@ -179,7 +201,8 @@ def metrics_of(gpu: Gpu, launches: Sequence[LaunchProfile], time: ModelledTime) 
         return {}
     for launch in launches[1:]:
         total = total + launch.memory.total
-    issue = sum(issue_slots(gpu, launch) for launch in launches)
+    issued = sum(sum(instruction_counts(gpu, launch).values()) for launch in launches)
+    busiest = sum(issue_cycles(gpu, launch) for launch in launches)
     cycles = gpu["sm_count"] * gpu["clock_mhz"] * 1e6 * time.seconds
     peak_bytes = gpu["dram_bandwidth"] * time.seconds
 
@@ -190,8 +213,8 @@ def metrics_of(gpu: Gpu, launches: Sequence[LaunchProfile], time: ModelledTime) 
         "vram_percent": share(SECTOR_BYTES * total.dram_sectors, peak_bytes),
         "read_percent": share(SECTOR_BYTES * total.dram_read, peak_bytes),
         "write_percent": share(SECTOR_BYTES * total.dram_write, peak_bytes),
-        "sm_percent": share(issue, cycles),
-        "sm_issue_percent": share(issue, cycles),
+        "sm_percent": share(max(busiest * gpu["issue_efficiency"], issued / gpu["schedulers_per_sm"]), cycles),
+        "sm_issue_percent": share(issued / gpu["schedulers_per_sm"], cycles),
         "l2_percent": share(SECTOR_BYTES * total.l2_sectors, gpu["l2_bandwidth"] * time.seconds),
         "tex_percent": share(total.l1_request_bytes / gpu["l1_bytes_per_clk"], cycles),
         "l2_hit_percent": share(total.l2_hit, total.l2_sectors),

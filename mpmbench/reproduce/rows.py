@@ -16,7 +16,7 @@ from mpmbench.device import KernelInfo, LaunchProfile
 from mpmbench.environment import Environment
 from mpmbench.gpu import CALIBRATED, Constant, Gpu
 from mpmbench.gpu.calibration import CELLS, Cell, calibrate, to_toml
-from mpmbench.gpu.model import metrics_of, model_launches, rates_of
+from mpmbench.gpu.model import busy_sms, issue_cycles, metrics_of, model_launches, rates_of
 from mpmbench.gpu.modelled import ModelledTime
 from mpmbench.primitive_runs import PrimitiveCase
 from mpmbench.profile import Modeller, occupancy_warps, run_modelled
@@ -134,9 +134,13 @@ def write_calibration(rows: Sequence[Row], gpu: Gpu) -> Path:
 
 
 def _with_latencies(launch: LaunchProfile, counted_for: Gpu, gpu: Gpu) -> LaunchProfile:
-    factor = 1.0
+    """The latency term moves with the busiest pipe of the SMs for the part that this fills, else with the latencies."""
+    before, now = (max(issue_cycles(one, launch) / busy_sms(one, launch.blocks), 1e-9) for one in (counted_for, gpu))
+    filled = min(1.0, before / max(1, launch.memory.latency_cycles))
+    waiting = 1.0
     for name, share in latency_shares(launch, counted_for).items():
-        factor += share * (gpu[name] / counted_for[name] - 1)
+        waiting += share * (gpu[name] / counted_for[name] - 1)
+    factor = filled * now / before + (1 - filled) * waiting
     return replace(launch, memory=replace(launch.memory, latency_cycles=round(factor * launch.memory.latency_cycles)))
 
 

@@ -84,15 +84,15 @@ _READY, _REPLAYING, _WAITING, _ENDED = range(4)
 # Columns of a resident warp's row: its state and what the code returned when it stopped; what memory and barriers
 # added to its clock, and what queues added to that; when it arrived where it waits; the request to replay next, how
 # many are written down, and which of the words of a run; loads that it waits for, and the segment that they belong to;
-# sectors and lanes of the request.
+# sectors and lanes of the request; what it has taken of the issue slots and of the shared-memory pipe.
 (
     _STATE, _STATUS_OF, _OFFSET, _QUEUED, _ARRIVAL, _NEXT, _RECORDED, _WORD, _PENDING_COUNT, _PENDING_CLOCK, _SECTORS,
-    _LANES,
-) = range(12)  # fmt: skip
+    _LANES, _ISSUED, _SHARED_TAKEN,
+) = range(14)  # fmt: skip
 
-# Columns of a slot's row: warps that run, warps that wait at a barrier; when the thread block started, when its last
-# barrier opened, and what its warps had taken by then of the issue slots and of the shared-memory pipe.
-_RUNNING, _AT_BARRIER, _STARTED, _OPENED, _ISSUED, _SHARED_TAKEN = range(6)
+# Columns of a slot's row: warps that run, warps that wait at a barrier; when the thread block started, and when its
+# last barrier opened.
+_RUNNING, _AT_BARRIER, _STARTED, _OPENED = range(4)
 
 # Outcomes of a replay; the last one is followed by waits for L1, L2 and DRAM.
 _FAULT, _STOP_SLOT, _STOP_WARP, _LATENCY_CYCLES, _WARP_CYCLES, _BARRIER_WAIT, _PEAK_WARPS, _WAITS = range(8)
@@ -255,12 +255,12 @@ def _start_block(launch, contexts, halves, jobs, warps, slots, slot, block, star
         warps[warp, _QUEUED] = queued
         warps[warp, _PENDING_COUNT] = 0
         warps[warp, _PENDING_CLOCK] = -1
+        warps[warp, _ISSUED] = 0
+        warps[warp, _SHARED_TAKEN] = 0
     slots[slot, _RUNNING] = count
     slots[slot, _AT_BARRIER] = 0
     slots[slot, _STARTED] = start
     slots[slot, _OPENED] = start
-    slots[slot, _ISSUED] = 0
-    slots[slot, _SHARED_TAKEN] = 0
 
 
 @inlined
@@ -282,10 +282,17 @@ def _wait_for_loads(warps, pending, outcome, warp, clock, until):
 
 
 @inlined
-def _arrive(warps, slots, pending, outcome, slot, warp, clock):
-    """The warp has replayed everything up to a barrier or its end."""
+def _arrive(warps, slots, pipes, contexts, pending, outcome, slot, sm, warp, at):
+    """The warp has replayed everything up to a barrier or its end, not before its SM's pipes had time for its work."""
     _wait_for_loads(warps, pending, outcome, warp, warps[warp, _PENDING_CLOCK], _ALL_USES)
-    warps[warp, _ARRIVAL] = clock + warps[warp, _OFFSET]
+    opened = slots[slot, _OPENED]
+    issued, shared = contexts[at + _ISSUE], contexts[at + _SHARED_PIPE]
+    pipes[sm, 0] = max(pipes[sm, 0], opened * ISSUE_UNITS) + issued - warps[warp, _ISSUED]
+    pipes[sm, 1] = max(pipes[sm, 1], opened) + shared - warps[warp, _SHARED_TAKEN]
+    warps[warp, _ISSUED] = issued
+    warps[warp, _SHARED_TAKEN] = shared
+    arrival = max(contexts[at + _CLOCK] + warps[warp, _OFFSET], pipes[sm, 0] // ISSUE_UNITS, pipes[sm, 1])
+    warps[warp, _ARRIVAL] = arrival
     at_barrier = warps[warp, _STATUS_OF] == _STATUS_BARRIER
     warps[warp, _STATE] = _WAITING if at_barrier else _ENDED
     slots[slot, _RUNNING] -= 1
@@ -304,18 +311,17 @@ def replay(
     channels, banks, row_pieces = machine[_CHANNELS], machine[_BANKS], machine[_ROW_PIECES]
     l1_latency, l2_latency, dram_latency = machine[_L1_LATENCY], machine[_L2_LATENCY], machine[_DRAM_LATENCY]
     total = slot_count * count
-    warps = np.zeros((total, 12), np.int64)
-    slots = np.zeros((slot_count, 6), np.int64)
+    warps = np.zeros((total, 14), np.int64)
+    slots = np.zeros((slot_count, 4), np.int64)
     pending = np.zeros((total, _PENDING, 3), np.int64)
     saved = np.zeros((total, 64), np.int64)
     covered = np.zeros(64, np.int64)
     table = np.zeros(128, np.int64)
     last = np.zeros(1, np.int64)
     port = np.zeros(sms, np.int64)  # when each SM's way to L2 is free
-    heap = np.zeros((total + 1, 2), np.int64)
+    pipes = np.zeros((sms, 2), np.int64)  # when each SM's issue slots [ISSUE_UNITS] and shared memory are free
+    heap = np.zeros((total + slot_count + 1, 2), np.int64)  # of warps with requests, and of slots with code to run
     heap_size = 0
-    todo = np.zeros(slot_count + 1, np.int64)  # slots whose warps have code to run
-    todo_count = 0
     jobs_at = jobs.ctypes.data
     next_block = np.int64(0)
 
@@ -324,16 +330,19 @@ def replay(
     for slot in range(slot_count):
         _start_block(launch, contexts, halves, jobs, warps, slots, slot, next_block, np.int64(0), np.int64(0))
         next_block += 1
-    for slot in range(slot_count - 1, -1, -1):
-        todo[todo_count] = slot
-        todo_count += 1
+    for slot in range(slot_count):
+        _push(heap, heap_size, slot - slot_count, total + slot)
+        heap_size += 1
     outcome[_PEAK_WARPS] = total
 
-    while todo_count > 0 or heap_size > 0:
-        if todo_count > 0:
+    while heap_size > 0:
+        now, warp = heap[0, 0], heap[0, 1]
+        if warp >= total:
             # Run the code of every ready warp of a slot.
-            todo_count -= 1
-            slot = todo[todo_count]
+            slot = warp - total
+            heap_size -= 1
+            if heap_size > 0:
+                _replace_top(heap, heap_size, heap[heap_size, 0], heap[heap_size, 1])
             for warp in range(slot * count, (slot + 1) * count):
                 while warps[warp, _STATE] == _READY:
                     at = warp * words
@@ -360,10 +369,9 @@ def replay(
                         _push(heap, heap_size, key, warp)
                         heap_size += 1
                     elif status != _STATUS_YIELD:
-                        _arrive(warps, slots, pending, outcome, slot, warp, contexts[at + _CLOCK])
+                        _arrive(warps, slots, pipes, contexts, pending, outcome, slot, slot % sms, warp, at)
         else:
             # Replay the earliest request.
-            now, warp = heap[0, 0], heap[0, 1]
             slot = warp // count
             sm = slot % sms
             at = warp * capacity + warps[warp, _NEXT]
@@ -391,35 +399,32 @@ def replay(
 
             latency = np.int64(0)
             exchanged = np.int64(0)
+            unit = sm * l1_per_sm + warp % l1_per_sm
+            in_l1 = kind == _LOAD and facts[site, _IN_L1] != 0
             if kind == _LOAD:
                 tallies[site, _REQUEST_BYTES] += lanes * width
-                unit = sm * l1_per_sm + warp % l1_per_sm
-                in_l1 = facts[site, _IN_L1] != 0
-                for number in range(sectors):
-                    sector = saved[warp, number]
-                    if in_l1 and l1_access(l1_tags, l1_order, l1_bits, l1_sets, unit, sector):
-                        tallies[site, _L1_HIT] += 1
-                        latency = max(latency, l1_latency)
-                    else:
-                        tallies[site, _L1_MISS] += 1
-                        exchanged += 1
-                        hit = l2_access(
-                            l2_tags, l2_order, l2_bits, l2_writers, l2_sets, open_rows, channels, banks, row_pieces,
-                            tallies, site, sector, FETCH,
-                        )  # fmt: skip
-                        latency = max(latency, (l2_latency if hit else dram_latency) + exchanged)
-            else:
-                exchanged = sectors
-                if kind == _ATOMIC:
-                    tallies[site, _ATOMIC_LANES] += lanes
-                    tallies[site, _ATOMIC_SECTORS] += sectors
-                for number in range(sectors):
-                    action = ADD if kind == _ATOMIC else FILL if covered[number] == 0xFFFFFFFF else PART
-                    hit = l2_access(
-                        l2_tags, l2_order, l2_bits, l2_writers, l2_sets, open_rows, channels, banks, row_pieces,
-                        tallies, site, saved[warp, number], action,
-                    )  # fmt: skip
-                    latency = max(latency, (l2_latency if hit else dram_latency) + number)
+            elif kind == _ATOMIC:
+                tallies[site, _ATOMIC_LANES] += lanes
+                tallies[site, _ATOMIC_SECTORS] += sectors
+            for number in range(sectors):
+                sector = saved[warp, number]
+                if in_l1 and l1_access(l1_tags, l1_order, l1_bits, l1_sets, unit, sector):
+                    tallies[site, _L1_HIT] += 1
+                    latency = max(latency, l1_latency)
+                    continue
+                action = FETCH
+                if kind == _LOAD:
+                    tallies[site, _L1_MISS] += 1
+                elif kind == _ATOMIC:
+                    action = ADD
+                else:
+                    action = FILL if covered[number] == 0xFFFFFFFF else PART
+                hit = l2_access(
+                    l2_tags, l2_order, l2_bits, l2_writers, l2_sets, open_rows, channels, banks, row_pieces, tallies,
+                    site, sector, action,
+                )  # fmt: skip
+                exchanged += 1
+                latency = max(latency, (l2_latency if hit else dram_latency) + exchanged)
 
             begin = max(now, port[sm])
             port[sm] = begin + max(np.int64(1), exchanged)
@@ -449,10 +454,10 @@ def replay(
                 _replace_top(heap, heap_size, heap[heap_size, 0], heap[heap_size, 1])
             if warps[warp, _STATUS_OF] == _STATUS_YIELD:
                 warps[warp, _STATE] = _READY
-                todo[todo_count] = slot
-                todo_count += 1
+                _push(heap, heap_size, now, total + slot)
+                heap_size += 1
                 continue
-            _arrive(warps, slots, pending, outcome, slot, warp, contexts[warp * words + _CLOCK])
+            _arrive(warps, slots, pipes, contexts, pending, outcome, slot, sm, warp, warp * words)
 
         if slots[slot, _RUNNING] > 0:
             continue
@@ -460,17 +465,10 @@ def replay(
         waits = slots[slot, _AT_BARRIER] > 0
         latest = np.int64(0)
         latest_queued = np.int64(0)
-        issued = np.int64(0)
-        shared = np.int64(0)
         for warp in range(slot * count, (slot + 1) * count):
-            issued += contexts[warp * words + _ISSUE]
-            shared += contexts[warp * words + _SHARED_PIPE]
             if not waits or warps[warp, _STATE] == _WAITING:
                 latest = max(latest, warps[warp, _ARRIVAL])
                 latest_queued = max(latest_queued, warps[warp, _ARRIVAL] + warps[warp, _QUEUED])
-        # All warps of the block share the SM's pipes: the interval takes as long as their work on the busiest one.
-        latest = max(latest, slots[slot, _OPENED] + (issued - slots[slot, _ISSUED]) // ISSUE_UNITS)
-        latest = max(latest, slots[slot, _OPENED] + shared - slots[slot, _SHARED_TAKEN])
         queued = max(np.int64(0), latest_queued - latest)
         if waits:
             for warp in range(slot * count, (slot + 1) * count):
@@ -482,8 +480,7 @@ def replay(
             slots[slot, _RUNNING] = slots[slot, _AT_BARRIER]
             slots[slot, _AT_BARRIER] = 0
             slots[slot, _OPENED] = latest
-            slots[slot, _ISSUED] = issued
-            slots[slot, _SHARED_TAKEN] = shared
+            start = latest
         else:
             for warp in range(slot * count, (slot + 1) * count):
                 outcome[_WARP_CYCLES] += warps[warp, _ARRIVAL] - slots[slot, _STARTED]
@@ -493,8 +490,8 @@ def replay(
             start = latest + machine[_BLOCK_START]
             _start_block(launch, contexts, halves, jobs, warps, slots, slot, next_block, start, queued)
             next_block += 1
-        todo[todo_count] = slot
-        todo_count += 1
+        _push(heap, heap_size, start + queued, total + slot)
+        heap_size += 1
 
     for at in range(l2_bits.size):
         if l2_bits[at] >> 4:
