@@ -15,7 +15,7 @@ import functools
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,8 +23,11 @@ from mpmbench.errors import InputError
 from mpmbench.simt import cache, codegen_count, native, ptx, scheduler
 from mpmbench.simt.codegen import MODES, KernelCode, generate
 from mpmbench.simt.codegen_memory import SINK_BYTES, SINK_REACH, Site
-from mpmbench.simt.counters import Counters, Finding, SourceLine
+from mpmbench.simt.counters import INFO, Counters, Finding, SourceLine
 from mpmbench.simt.tally import counters_from
+
+if TYPE_CHECKING:
+    from mpmbench.simt.checks import Written
 
 __all__ = ["DEFAULT_BUDGET", "Kernel", "LaunchResult", "Module", "compile_ptx"]
 
@@ -37,10 +40,11 @@ _MAX_SHARED = 227 * 1024  # of the largest GPU (Hopper)
 
 @dataclass(frozen=True)
 class LaunchResult:
-    """counters: in mode ``count``; findings: defects seen, in any mode."""
+    """counters: in mode ``count``; findings: defects seen, in any mode; notes: findings that are INFO, no defects."""
 
     counters: Counters | None
     findings: tuple[Finding, ...]
+    notes: tuple[Finding, ...] = ()
 
 
 def compile_ptx(text: str, mode: str = "run", lane_width: int = 16) -> Module:
@@ -136,13 +140,18 @@ class Kernel:
         seed: int | None = None,
         budget: int | None = None,
         allocations: Sequence[np.ndarray] = (),
+        fuzz: bool = False,
+        names: Sequence[str] = (),
+        written: Written | None = None,
     ) -> LaunchResult:
         """Run the kernel.
 
         grid, block: thread blocks and threads per axis (x, y, z). args: C-contiguous NumPy arrays, which are the
         memory itself, NumPy scalars, and structured NumPy scalars passed by value. shared_bytes: dynamic shared
         memory. seed: of the warp order in mode debug. budget: warp instructions that loops may repeat. allocations:
-        further arrays that pointers inside structures may point to.
+        further arrays that pointers inside structures may point to. fuzz: in mode debug, let lanes that part run in a
+        random order too, instead of the lower program counter first. names: of the arguments, for findings. written:
+        which memory is known to be uninitialised (debug).
         """
         job = _Job(self.module, self.facts, _three(grid, "grid"), _three(block, "block"), shared_bytes, self.name)
         job.set_arguments(args)
@@ -151,15 +160,17 @@ class Kernel:
         if self.module.mode == "debug":
             from mpmbench.simt.checks import Checker
 
-            checker = Checker(self.facts, job, [*args, *allocations], 0 if seed is None else seed)
+            job.set("split_mask", scheduler.OFTEN_SPLIT if fuzz else scheduler.NEVER_SPLIT)
+            checker = Checker(self.facts, job, [*args, *allocations], seed or 0, names, written)
         status = self._launch(job.address) if job.threads else 0
         findings = _faults(self.name, self.facts, job, status)
         if checker is not None:
             findings += checker.findings(self.name)
+        notes = tuple(finding for finding in findings if finding.severity == INFO)
         counters = None
         if self.module.mode == "count":
             counters = counters_from(self.facts, job.counters)
-        return LaunchResult(counters, tuple(findings))
+        return LaunchResult(counters, tuple(f for f in findings if f.severity != INFO), notes)
 
 
 # --- one launch ---------------------------------------------------------------------------------------------------
