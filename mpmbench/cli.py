@@ -587,5 +587,7 @@ def _summarise(records: list[Any], written: Sequence[Path]) -> None:
         sys.exit(1)
 
 
+import mpmbench.cli_sanitize  # noqa: E402, F401  (registers its command; needs the helpers above)
+
 if __name__ == "__main__":
     main()

@@ -43,6 +43,7 @@ class Launch:
 
     args: device arrays, NumPy scalars (np.int32, np.float64, ...) or structured NumPy scalars passed by value.
     shared_bytes: dynamic shared memory per thread block.
+    names: of the arguments, for messages; empty: those that the kernel's text gives them.
     """
 
     name: str
@@ -51,14 +52,16 @@ class Launch:
     block: tuple[int, int, int]
     args: tuple[Any, ...] = field(repr=False, compare=False)
     shared_bytes: int = 0
+    names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class LaunchReport:
-    """What a launch tells besides its outputs; on ``cuda`` both are empty."""
+    """What a launch tells besides its outputs; on ``cuda`` all are empty. notes: findings that are no defects."""
 
     counters: Counters | None = None
     findings: tuple[Finding, ...] = ()
+    notes: tuple[Finding, ...] = ()
 
 
 class Device(Protocol):
@@ -91,12 +94,14 @@ def run_all(device: Device, launches: Sequence[Launch]) -> LaunchReport:
     """Run launches in order and add up what they report."""
     counters: Counters | None = None
     findings: list[Finding] = []
+    notes: list[Finding] = []
     for launch in launches:
         report = device.launch(launch)
         if report.counters is not None:
             counters = report.counters if counters is None else counters + report.counters
         findings.extend(report.findings)
-    return LaunchReport(counters, tuple(findings))
+        notes.extend(report.notes)
+    return LaunchReport(counters, tuple(findings), tuple(notes))
 
 
 def open_device(name: str, **options: Any) -> Device:

@@ -8,7 +8,7 @@ import numpy as np
 
 from mpmbench.device import CompiledKernel, KernelInfo, Launch, LaunchReport
 from mpmbench.errors import InputError
-from mpmbench.kernel import COMPILE_OPTIONS, KernelSource
+from mpmbench.kernel import COMPILE_OPTIONS, KernelSource, parameter_names
 from mpmbench.simt.nvrtc import compile_cuda, supported_archs
 
 MODES = ("run", "count", "debug", "oracle")
@@ -20,18 +20,26 @@ class SimulatedDevice:
     """Runs kernels warp by warp; arrays are NumPy arrays.
 
     arch: what NVRTC compiles for.  mode: "run" gives results only, "count" counters too, "debug" findings (slow),
-    "oracle" the plain NumPy executor that the engine is held to (very slow).  seed: warp order in debug mode.
+    "oracle" the plain NumPy executor that the engine is held to (very slow).  In debug mode, seed: of the warp order;
+    fuzz: lanes that part run in a random order too; budget: warp instructions that loops may repeat (None: much).
     """
 
     name = "simulated"
 
-    def __init__(self, arch: str = "sm_90", mode: str = "count", seed: int = 0) -> None:
+    def __init__(
+        self, arch: str = "sm_90", mode: str = "count", seed: int = 0, fuzz: bool = False, budget: int | None = None
+    ) -> None:
         if mode not in MODES:
             raise InputError(f"unknown mode {mode!r} of the simulated device: valid are {', '.join(MODES)}")
         if arch not in (known := supported_archs()):
             raise InputError(f"NVRTC cannot compile for {arch!r}: valid are {', '.join(known)}")
-        self.arch, self.mode, self.seed = arch, mode, seed
+        self.arch, self.mode, self.seed, self.fuzz, self.budget = arch, mode, seed, fuzz, budget
         self._modules: dict[str, Any] = {}
+        self._written: Any = None  # debug: which bytes of fresh memory have been written
+        if mode == "debug":
+            from mpmbench.simt.checks import Written
+
+            self._written = Written()
 
     def upload(self, host: np.ndarray) -> np.ndarray:
         array = _aligned(host.shape, host.dtype)
@@ -42,6 +50,7 @@ class SimulatedDevice:
         array = _aligned(shape, np.dtype(dtype))
         if self.mode == "debug":
             array.reshape(-1).view(np.uint8)[...] = POISON
+            self._written.allocate(array)
         return array
 
     def download(self, array: np.ndarray) -> np.ndarray:
@@ -70,11 +79,20 @@ class SimulatedDevice:
         return kernel_infos(self.ptx(kernel.source), self.arch)[kernel.entry]
 
     def launch(self, launch: Launch) -> LaunchReport:
-        seed = {"seed": self.seed} if self.mode == "debug" else {}
+        options: dict[str, Any] = {}
+        if self.mode == "debug":
+            names = launch.names or parameter_names(launch.kernel.source.text, launch.kernel.entry)
+            options = {
+                "seed": self.seed,
+                "fuzz": self.fuzz,
+                "budget": self.budget,
+                "names": names,
+                "written": self._written,
+            }
         result = launch.kernel.handle.launch(
-            launch.grid, launch.block, launch.args, shared_bytes=launch.shared_bytes, **seed
+            launch.grid, launch.block, launch.args, shared_bytes=launch.shared_bytes, **options
         )
-        return LaunchReport(result.counters, result.findings)
+        return LaunchReport(result.counters, result.findings, result.notes)
 
     def synchronize(self) -> None:
         """Launches return when they are done."""

@@ -30,6 +30,7 @@ from numba import carray, types
 from numba.extending import intrinsic
 
 from mpmbench.simt.counters import ERROR, INFO, WARNING, Finding, SourceLine
+from mpmbench.simt.naming import block_text, line_text, threads_text
 from mpmbench.simt.scheduler import CONTEXT_FENCED, CONTEXT_WARP, CONTEXT_WARP_EPOCH, JOB, JOB_BYTES
 
 if TYPE_CHECKING:
@@ -103,7 +104,7 @@ def _callback(function: Callable[..., Any]) -> Any:
 
 def _pointer_to(element: types.Type) -> Any:
     @intrinsic
-    def at(typing_context, address):  # noqa: ARG001
+    def at(typing_context, address):
         def generate(context, builder, signature, arguments):
             return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
 
@@ -554,19 +555,19 @@ class Checker:
             waiting = job.get("stranded_waiting")
             warps = [warp for warp in range(job.warps) if waiting >> warp & 1]
             ended = [warp for warp in range(job.warps) if not waiting >> warp & 1]
-            block = self._block(job.get("stranded_block"))
+            block = block_text(job, job.get("stranded_block"))
             threads = f"warps {_numbers(warps)} of block {block}"
             message = (
-                f"{kernel}: Divergent thread(s) in block: {threads} wait at the barrier in {_place(line)}, "
+                f"{kernel}: Divergent thread(s) in block: {threads} wait at the barrier in {line_text(line)}, "
                 f"warps {_numbers(ended)} end without it"
             )
             result.append(Finding("divergent-barrier", kernel, message, line, None, stranded, threads=threads))
         if mixed := job.get("mixed"):
             line, other = (self._line_at_barrier(job.get(name)) for name in ("mixed_segment", "mixed_other"))
-            threads = f"block {self._block(job.get('mixed_block'))}"
+            threads = f"block {block_text(job, job.get('mixed_block'))}"
             message = (
                 f"{kernel}: Divergent thread(s) in block: warps of {threads} wait at different barriers, in "
-                f"{_place(line)} and {_place(other)}"
+                f"{line_text(line)} and {line_text(other)}"
             )
             result.append(Finding("divergent-barrier", kernel, message, line, other, mixed, WARNING, threads))
         return result
@@ -593,29 +594,29 @@ class Checker:
         other_warp: int,
         other_lanes: int,
     ) -> Finding:
-        what = self._facts.sites[site]
+        job, what = self._job, self._facts.sites[site]
         line = self._line_at(what.index)
         space, place = self._address(what.space, address, warp, lanes)
         size = f"{what.width * (what.run if kind in _WHOLE_RUN else 1)} bytes"
-        threads = f"{self._threads(warp, lanes)} in block {self._block(block)}"
+        threads = f"{threads_text(job, warp, lanes)} in block {block_text(job, block)}"
         verb = "atomic" if what.kind == "atomic" else "read" if what.kind == "load" else "write"
         if kind in _ALONE:
             name, text = _ALONE[kind]
             text = text.format(space=space, verb=verb, size=size, width=what.width)
-            message = f"{kernel}: {text} at {_place(line)} by {threads}: {place}"
+            message = f"{kernel}: {text} at {line_text(line)} by {threads}: {place}"
             return Finding(name, kernel, message, line, None, count, ERROR, threads, place)
         before = self._facts.sites[other]
         other_line = self._line_at(before.index)
         name, severity, text = _TOGETHER[kind]
         if other_warp < 0:
-            others = f"block {self._block(other_block)}"
+            others = f"block {block_text(job, other_block)}"
         elif other_block == block:
-            others = self._threads(other_warp, other_lanes)
+            others = threads_text(job, other_warp, other_lanes)
         else:
-            others = f"{self._threads(other_warp, other_lanes)} in block {self._block(other_block)}"
+            others = f"{threads_text(job, other_warp, other_lanes)} in block {block_text(job, other_block)}"
         message = (
-            f"{kernel}: Race reported between {_ACCESS[before.kind]} access at {_place(other_line)} by {others} and "
-            f"{_ACCESS[what.kind]} access at {_place(line)} by {threads}: {text}; {size}, {place}"
+            f"{kernel}: Race reported between {_ACCESS[before.kind]} access at {line_text(other_line)} by {others} and "
+            f"{_ACCESS[what.kind]} access at {line_text(line)} by {threads}: {text}; {size}, {place}"
         )
         return Finding(name, kernel, message, line, other_line, count, severity, f"{others}; {threads}", place)
 
@@ -643,28 +644,7 @@ class Checker:
             return "__global__", f"address {address:#x}, {start - address} bytes before {name} of {end - start} bytes"
         return "__global__", f"address {address:#x}, {address - end} bytes after {name} of {end - start} bytes"
 
-    def _threads(self, warp: int, lanes: int) -> str:
-        return threads_text(self._job, warp, lanes)
 
-    def _block(self, number: int) -> str:
-        return block_text(self._job, number)
-
-
-def threads_text(job: _Job, warp: int, lanes: int) -> str:
-    """The threads of a warp's lanes in compute-sanitizer's words: ``threads (3,0,0), (4,0,0) and 5 more``."""
-    x, y = max(job.get("block_x"), 1), max(job.get("block_y"), 1)
-    numbers = [32 * warp + lane for lane in range(32) if lanes >> lane & 1]
-    named = [f"({n % x},{n // x % y},{n // (x * y)})" for n in numbers[:_NAMED_THREADS]]
-    more = f" and {len(numbers) - len(named)} more" if len(numbers) > len(named) else ""
-    return f"thread{'s' if len(numbers) > 1 else ''} {', '.join(named)}{more}"
-
-
-def block_text(job: _Job, number: int) -> str:
-    x, y = max(job.get("grid_x"), 1), max(job.get("grid_y"), 1)
-    return f"({number % x},{number // x % y},{number // (x * y)})"
-
-
-_NAMED_THREADS = 4
 _ACCESS = {"load": "Read", "store": "Write", "atomic": "Atomic"}
 _WHOLE_RUN = frozenset({_UNINITIALISED, _OUTSIDE})
 
@@ -689,10 +669,6 @@ _TOGETHER = {
 
 def _numbers(values: Sequence[int]) -> str:
     return ", ".join(map(str, values)) or "none"
-
-
-def _place(line: SourceLine | None) -> str:
-    return f"{line.file}:{line.line}" if line else "an unknown line"
 
 
 def _is_memory(argument: Any) -> bool:

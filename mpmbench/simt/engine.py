@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mpmbench.errors import InputError
-from mpmbench.simt import cache, codegen_count, native, ptx, scheduler
+from mpmbench.simt import cache, codegen_count, naming, native, ptx, scheduler
 from mpmbench.simt.codegen import MODES, KernelCode, generate
 from mpmbench.simt.codegen_memory import SINK_BYTES, SINK_REACH, Site
 from mpmbench.simt.counters import INFO, Counters, Finding, SourceLine
@@ -293,19 +293,24 @@ def _faults(name: str, facts: _Description, job: _Job, status: int) -> list[Find
     if status == 0:
         return []
     kind, text = {
-        scheduler.FAULT_DIVERGENT_BARRIER: ("divergent-barrier", "only some lanes of a warp reach a barrier"),
+        scheduler.FAULT_DIVERGENT_BARRIER: (
+            "divergent-barrier",
+            "Divergent thread(s) in warp: only some lanes of a warp reach the barrier",
+        ),
         scheduler.FAULT_BUDGET: ("runaway", "a loop spends the instruction budget"),
         scheduler.FAULT_TRAP: ("trap", "the kernel executes a trap"),
         scheduler.FAULT_MASK: (
             "bad-mask",
-            "a warp operation's member mask does not match the lanes that execute it",
+            "Invalid arguments: the member mask of a warp operation does not match the lanes that execute it",
         ),
     }[status]
-    segment = job.get("stop_segment")
+    segment, warp = job.get("stop_segment"), job.get("stop_warp")
     line = line_of(facts, facts.segments[segment][1] - 1)
-    where = f"{line.file}:{line.line}" if line else "unknown line"
-    message = f"{name}: {text} ({where}, thread block {job.get('block')}, warp {job.get('stop_warp')}); launch stopped"
-    return [Finding(kind, name, message, line)]
+    context = job.contexts[warp * facts.context_bytes :][: facts.context_bytes].view(np.uint32)
+    waiting, live = int(context[scheduler.CONTEXT_SLOTS // 4 + segment]), int(context[scheduler.CONTEXT_LIVE // 4])
+    threads = f"{naming.threads_text(job, warp, waiting or live)} in block {naming.block_text(job, job.get('block'))}"
+    message = f"{name}: {text} at {naming.line_text(line)} by {threads}; launch stopped"
+    return [Finding(kind, name, message, line, threads=threads)]
 
 
 def line_of(facts: _Description, instruction: int) -> SourceLine | None:
