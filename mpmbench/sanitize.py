@@ -213,21 +213,25 @@ def _differences(
     now: Sequence[dict[str, np.ndarray]],
     seed: int,
 ) -> list[Finding]:
-    """The first launch whose arrays hold something else than under the first schedule."""
-    rounds = False
+    """Arrays that hold something else than under the first schedule, each with the first launch after which it does."""
+    rounds, found = False, {}
     for launch, kernel, before, after in zip(launches.launches, kernels, first, now, strict=True):
         rounds |= _adds_floats(kernel)
         for name, was in before.items():
+            if name in found:
+                continue
             differs = _differing(was, after[name], launches.arrays[name], rounds)
             if len(differs):
                 at = tuple(int(index) for index in np.unravel_index(differs[0], was.shape))
                 place = f"{name}[{', '.join(map(str, at))}]"
                 message = (
-                    f"{launch.kernel}: the result depends on the schedule: {len(differs)} of {was.size} elements of {name} "
-                    f"differ between schedules 0 and {seed}, the first is {place}: {was[at]} and {after[name][at]}"
+                    f"{launch.kernel}: the result depends on the schedule: {len(differs)} of {was.size} elements of "
+                    f"{name} differ between schedules 0 and {seed}, first {place}: {was[at]} and {after[name][at]}"
                 )
-                return [Finding("schedule", launch.kernel, message, None, None, len(differs), WARNING, place=place)]
-    return []
+                found[name] = Finding(
+                    "schedule", launch.kernel, message, None, None, len(differs), WARNING, place=place
+                )
+    return list(found.values())
 
 
 def _adds_floats(kernel: CompiledKernel) -> bool:

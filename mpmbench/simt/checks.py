@@ -562,14 +562,15 @@ class Checker:
                 f"warps {_numbers(ended)} end without it"
             )
             result.append(Finding("divergent-barrier", kernel, message, line, None, stranded, threads=threads))
-        if mixed := job.get("mixed"):
-            line, other = (self._line_at_barrier(job.get(name)) for name in ("mixed_segment", "mixed_other"))
+        line, other = (self._line_at_barrier(job.get(name)) for name in ("mixed_segment", "mixed_other"))
+        mixed = job.get("mixed")
+        if mixed and line != other:  # a loop's barrier may stand in the code several times
             threads = f"block {block_text(job, job.get('mixed_block'))}"
             message = (
                 f"{kernel}: Divergent thread(s) in block: warps of {threads} wait at different barriers, in "
                 f"{line_text(line)} and {line_text(other)}"
             )
-            result.append(Finding("divergent-barrier", kernel, message, line, other, mixed, WARNING, threads))
+            result.append(Finding("divergent-barrier", kernel, message, line, other, mixed, threads=threads))
         return result
 
     def _line_at_barrier(self, segment: int) -> SourceLine | None:

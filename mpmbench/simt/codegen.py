@@ -851,6 +851,8 @@ class _Segment:
                 w.emit(f"br label %run{target}")
             else:
                 all_here = w.value(f"icmp eq i32 {mask}, {self._live()}")
+                if g.mode == "debug":
+                    self._choose(w.value(f"xor i1 {all_here}, true"), f"run{target}")
                 w.emit(f"br i1 {all_here}, label %run{target}, label %{g.chain(n + 1)}")
             return
         taken = self._guard_bits(mask)
@@ -863,7 +865,8 @@ class _Segment:
         some = w.value(f"icmp ne i32 {taken}, 0")
         rest = g.chain(n + 1)
         if g.mode == "debug" and target < count:
-            self._choose(taken, stay, rest if backward else f"run{target}")
+            part = w.value(f"and i1 {some}, {w.value(f'icmp ne i32 {stay}, 0')}")
+            self._choose(part, rest if backward else f"run{target}")
         if backward:
             w.emit(f"br i1 {some}, label %back{n}, label %{rest}")
             w.label(f"back{n}")
@@ -875,12 +878,10 @@ class _Segment:
         else:
             w.emit(f"br label %{rest}")
 
-    def _choose(self, taken: str, stay: str, unusual: str) -> None:
-        """Where the lanes part, let a random bit send them the unusual way first; the others go when those are done."""
+    def _choose(self, parted: str, unusual: str) -> None:
+        """Where lanes have parted, let a random bit choose another way to go on; who is passed over goes at the end."""
         w, n = self.w, self.number
-        some_taken, some_stay = (w.value(f"icmp ne i32 {lanes}, 0") for lanes in (taken, stay))
-        part = w.value(f"and i1 {some_taken}, {some_stay}")
-        w.emit(f"br i1 {part}, label %part{n}, label %usual{n}")
+        w.emit(f"br i1 {parted}, label %part{n}, label %usual{n}")
         w.label(f"part{n}")
         state = w.load("i64", w.at("%job", JOB["random"]), 8)
         for shift, amount in (("shl", 13), ("lshr", 7), ("shl", 17)):

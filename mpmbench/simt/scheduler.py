@@ -88,7 +88,7 @@ FAULT_MASK = 7
 FIRST_FAULT = FAULT_DIVERGENT_BARRIER
 
 NEVER_SPLIT = -1  # split masks: the state of the generator is never zero;
-OFTEN_SPLIT = 3 << 40  # one parting in four
+OFTEN_SPLIT = 1 << 40  # every other parting
 
 POISON = 0xFF  # 0xFFFFFFFF is a NaN, as a number it is -1
 
