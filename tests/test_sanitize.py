@@ -111,11 +111,11 @@ def test_every_check_has_three_defects_and_their_twins(check: str) -> None:
          "Read access at atomic_mix.cu:38|16 bytes, __shared__ 0x"),
         ("global_race", "read_4_bad", "Race reported between Read access at global_race.cu:16 by block (0,0,0) and "
          "Write access at global_race.cu:18 by thread (0,0,0) in block (1,0,0)|z + 256 of 8192 bytes"),
-        ("uninitialised", "global_4_bad", "Uninitialized __global__ memory read of size 4 bytes|uninitialised.cu:62|"
+        ("uninitialised", "global_4_bad", "Uninitialized __global__ memory read of size 4 bytes|uninitialised.cu:65|"
          "threads (60,0,0), (61,0,0), (62,0,0), (63,0,0) in block (0,0,0): fresh4 + 240 of 512 bytes [8 times]"),
         ("uninitialised", "shared_4_bad", "Uninitialized __shared__ memory read of size 4 bytes|uninitialised.cu:7|"
          "(60,0,0), (61,0,0), (62,0,0), (63,0,0) in block (0,0,0): __shared__ 0xf0"),
-        ("uninitialised", "local_8_bad", "Uninitialized __local__ memory read of size 8 bytes|uninitialised.cu:101|"
+        ("uninitialised", "local_8_bad", "Uninitialized __local__ memory read of size 8 bytes|uninitialised.cu:104|"
          "__local__ +0x18, thread has 128 bytes"),
         ("barrier_warp", "half_bad", "Divergent thread(s) in warp|barrier_warp.cu:4|threads (32,0,0), (33,0,0)"),
         ("barrier_block", "return_bad", "Divergent thread(s) in block: warps 0 of block (0,0,0)|barrier_block.cu:5|"

@@ -26,12 +26,12 @@ from typing import TYPE_CHECKING, Any
 
 import numba
 import numpy as np
-from numba import carray, types
+from numba import types
 from numba.extending import intrinsic
 
 from mpmbench.simt.counters import ERROR, INFO, WARNING, Finding, SourceLine
 from mpmbench.simt.naming import block_text, line_text, threads_text
-from mpmbench.simt.scheduler import CONTEXT_FENCED, CONTEXT_WARP, CONTEXT_WARP_EPOCH, JOB, JOB_BYTES
+from mpmbench.simt.scheduler import CONTEXT_FENCED, CONTEXT_WARP, CONTEXT_WARP_EPOCH, JOB
 
 if TYPE_CHECKING:
     from mpmbench.simt.engine import _Description, _Job
@@ -78,13 +78,11 @@ _FINDINGS = 512
 _BLOCK, _EPOCH = JOB["block"] // 8, JOB["epoch"] // 8
 _SHARED_BASE, _SHARED_BYTES = JOB["shared"] // 8, JOB["shared_bytes"] // 8
 _LOCAL, _LOCAL_END = JOB["local"] // 8, JOB["local_end"] // 8
-_JOB_WORDS = JOB_BYTES // 8
 _WARP, _WARP_EPOCH, _FENCED = CONTEXT_WARP // 8, CONTEXT_WARP_EPOCH // 8, CONTEXT_FENCED // 8
 _FENCED_BITS = 0xFFFF << 48  # of that word
 
 _WORD = types.CPointer(types.int64)
 _SIGNATURE = types.int32(_WORD, _WORD, _WORD, types.int64, types.int64, types.int32, _WORD, types.int64, _WORD)
-_UNBOUNDED = 1 << 40
 
 
 def _compiled(function: Callable[..., Any]) -> Any:
@@ -302,6 +300,13 @@ def _look_at_written(data, kind, site, width, address, start, bits, warp, lane, 
     memory = _bytes(bits)
     offset = address - start
     missing = False
+    while width >= 8 and offset & 7 == 0:
+        if memory[offset >> 3] != 0xFF:
+            missing = True
+            if kind != _LOAD:
+                memory[offset >> 3] = np.uint8(0xFF)
+        offset += 8
+        width -= 8
     while width > 0:
         bit = offset & 7
         count = min(8 - bit, width)
@@ -335,13 +340,8 @@ def _look_at_local(data, kind, site, width, offset, warp, lane, block, address):
 
 
 @_callback
-def _check(data_at, job_at, context_at, site, first_lane, bits, addresses_at, displacement, stored_at):
+def _check(data, job, context, site, first_lane, bits, addresses, displacement, stored_values):
     """-> the lanes that may go on. addresses: of the chunk's lanes, the first of which is ``first_lane``."""
-    data = carray(data_at, _UNBOUNDED)
-    job = carray(job_at, _JOB_WORDS)
-    context = carray(context_at, 64)
-    addresses = carray(addresses_at, 32)
-    stored_values = carray(stored_at, 32)
     about = data[_SITES_AT] + site * _SITE_WORDS
     kind, width, space, run = data[about], data[about + 1], data[about + 2], data[about + 3]
     order, element = data[about + 4], data[about + 6]
@@ -370,7 +370,7 @@ def _check(data_at, job_at, context_at, site, first_lane, bits, addresses_at, di
         lane = first_lane + place
         offset = address - shared
         if space == 1 or (space == 2 and 0 <= offset < shared_bytes):
-            if offset % width:
+            if offset & width - 1:
                 _report(data, _MISALIGNED, site, np.int64(-1), block, offset, warp, lane, block, 0, 0)
                 continue
             if offset < 0 or offset + whole > shared_bytes:
@@ -386,7 +386,7 @@ def _check(data_at, job_at, context_at, site, first_lane, bits, addresses_at, di
                 )
             passed |= 1 << place
             continue
-        if address % width:
+        if address & width - 1:
             _report(data, _MISALIGNED, site, np.int64(-1), block, address, warp, lane, block, 0, 0)
             continue
         if space == 3 or (space == 2 and 0 <= address - local < in_locals):

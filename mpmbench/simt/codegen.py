@@ -42,7 +42,7 @@ class KernelCode:
     sites: list[Site]
     counter_words: int
     hardware_ftz: bool
-    shared_granule: int = 4  # bytes: the narrowest element that the kernel accesses in shared memory
+    shared_granule: int = 4  # bytes: the narrowest access of the kernel to shared memory
     lines: list[tuple[str, int] | None] = field(default_factory=list)  # of the instructions
 
 
@@ -60,6 +60,8 @@ class _Generator:
         self.kernel, self.variables, self.mode = kernel, variables, mode
         self.w = Writer(lanes)
         self.lanes = lanes
+        # Debug: adds that run together with the next one.
+        self.unbroken = codegen_memory.joined_adds(kernel.instructions) if mode == "debug" else frozenset()
         self.segments = self._segments()
         self.forms = AddressForms(kernel.instructions)
         self.sites: list[Site] = []
@@ -84,7 +86,7 @@ class _Generator:
     def _ends_segment(self, item: Instruction) -> bool:
         if codegen_warp.is_collective(item) or codegen_warp.is_barrier(item):
             return True
-        if self.mode != "debug" or item.root not in ("ld", "st", "atom", "red"):
+        if self.mode != "debug" or item.root not in ("ld", "st", "atom", "red") or id(item) in self.unbroken:
             return False
         # Debug: other warps get a turn after every access to shared memory.
         return not {"global", "local", "const", "param"} & set(item.modifiers)
@@ -188,7 +190,7 @@ class _Generator:
         # Wrong lanes of a collective, traps and spent budgets end here.
         launch = scheduler.launch_text(self.context_bytes, self.hardware_ftz, self.mode == "debug")
         text = "\n".join([*w.declarations.values(), *function, launch])
-        widths = [site.element for site in self.sites if site.space in ("shared", "generic")]
+        widths = [site.width for site in self.sites if site.space in ("shared", "generic")]
         return KernelCode(
             self.kernel.name,
             text,

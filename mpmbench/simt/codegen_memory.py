@@ -645,6 +645,30 @@ def ordered_starts(instructions: Sequence[Instruction], borders: Container[int])
     return starts
 
 
+def joined_adds(instructions: Sequence[Instruction]) -> frozenset[int]:
+    """Adds that may be put off until another one follows, by ``id``: all but the last of at most four in a row."""
+    read = {reg for item in instructions for reg in item.reads()}
+    joined: set[int] = set()
+    last, length = None, 0
+    for item in instructions:
+        if item.root in ("atom", "red") and "add" in item.modifiers and not any(dst in read for dst in item.dsts):
+            if last is not None and length < _JOINED:
+                joined.add(id(last))
+                length += 1
+            else:
+                length = 1
+            last = item
+        elif item.root in _BREAKS:
+            last, length = None, 0
+    return frozenset(joined)
+
+
+_JOINED = 4
+_BREAKS = frozenset(
+    {"ld", "st", "atom", "red", "bra", "brx", "bar", "barrier", "membar", "fence", "ret", "exit", "trap", "shfl"}
+)
+
+
 def _sees_deferred(item: Instruction) -> bool:
     """Whether a load or store must find the adds that were put off carried out."""
     if item.root not in ("ld", "st") or {"param", "const"} & set(item.modifiers):
