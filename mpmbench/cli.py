@@ -646,7 +646,7 @@ def _summarise(records: list[Any], written: Sequence[Path]) -> None:
         sys.exit(1)
 
 
-from mpmbench import cli_profile  # noqa: E402  # adds its command to main; it needs what stands above
+from mpmbench import cli_profile, cli_sanitize  # noqa: E402, F401  # they add their commands; they need what stands above
 
 if __name__ == "__main__":
     main()

@@ -62,6 +62,25 @@ def load_source(
     return KernelSource(path.stem, text, defines, hashlib.sha256(text.encode()).hexdigest())
 
 
+def parameter_names(text: str, entry: str) -> tuple[str, ...]:
+    """What a kernel's text calls its parameters, in order; empty where its head is not found."""
+    plain = re.sub(r"//[^\n]*|/\*.*?\*/", " ", text, flags=re.S)
+    for head in re.finditer(rf"\b{re.escape(entry)}\s*\(", plain):
+        depth, start, parts = 1, head.end(), []
+        for at in range(head.end(), len(plain)):
+            letter = plain[at]
+            depth += (letter in "(<[") - (letter in ")>]")
+            if (letter == "," and depth == 1) or depth == 0:
+                parts.append(plain[start:at])
+                start = at + 1
+            if depth == 0:
+                break
+        if "__global__" in plain[: head.start()].rpartition(";")[2]:
+            names = [re.findall(r"\w+", part.partition("[")[0]) for part in parts]
+            return tuple(words[-1] if words else "" for words in names)
+    return ()
+
+
 def _macro_value(value: object) -> str:
     return str(int(value)) if isinstance(value, bool) else str(value)
 

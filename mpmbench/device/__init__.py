@@ -45,6 +45,7 @@ class Launch:
 
     args: device arrays, NumPy scalars (np.int32, np.float64, ...) or structured NumPy scalars passed by value.
     shared_bytes: dynamic shared memory per thread block.
+    names: of the arguments, for messages; empty: those that the kernel's text gives them.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Launch:
     block: tuple[int, int, int]
     args: tuple[Any, ...] = field(repr=False, compare=False)
     shared_bytes: int = 0
+    names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -75,10 +77,14 @@ class LaunchProfile:
 
 @dataclass(frozen=True)
 class LaunchReport:
-    """What a launch tells besides its outputs; on ``cuda`` all are empty. profiles: one per launch in mode profile."""
+    """What a launch tells besides its outputs; on ``cuda`` all are empty.
+
+    notes: findings that are no defects.  profiles: one per launch in mode profile.
+    """
 
     counters: Counters | None = None
     findings: tuple[Finding, ...] = ()
+    notes: tuple[Finding, ...] = ()
     profiles: tuple[LaunchProfile, ...] = ()
 
 
@@ -113,13 +119,14 @@ def run_all(device: Device, launches: Sequence[Launch]) -> LaunchReport:
     counters: Counters | None = None
     findings: list[Finding] = []
     profiles: list[LaunchProfile] = []
+    notes: list[Finding] = []
     for launch in launches:
         report = device.launch(launch)
         profiles.extend(report.profiles)
         if report.counters is not None:
             counters = report.counters if counters is None else counters + report.counters
         findings.extend(report.findings)
-    return LaunchReport(counters, tuple(findings), tuple(profiles))
+    return LaunchReport(counters, tuple(findings), tuple(notes), tuple(profiles))
 
 
 def open_device(name: str, **options: Any) -> Device:

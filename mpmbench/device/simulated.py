@@ -10,7 +10,7 @@ import numpy as np
 
 from mpmbench.device import CompiledKernel, KernelInfo, Launch, LaunchProfile, LaunchReport
 from mpmbench.errors import InputError
-from mpmbench.kernel import COMPILE_OPTIONS, KernelSource
+from mpmbench.kernel import COMPILE_OPTIONS, KernelSource, parameter_names
 from mpmbench.simt.machine import Machine
 from mpmbench.simt.nvrtc import compile_cuda, supported_archs
 
@@ -24,8 +24,9 @@ class SimulatedDevice:
 
     arch: what NVRTC compiles for.  mode: "run" gives results only, "count" counters too, "debug" findings (slow),
     "profile" counters of a modelled GPU's memory system too, "oracle" the plain NumPy executor that the engine is held
-    to (very slow).  seed: warp order in debug mode.  machine: (facts of a kernel, threads and shared bytes per thread
-    block) -> the machine that mode profile models.
+    to (very slow).  In debug mode, seed: of the warp order; fuzz: lanes that part run in a random order too; budget:
+    warp instructions that loops may repeat (None: much).  machine: (facts of a kernel, threads and shared bytes per
+    thread block) -> the machine that mode profile models.
     """
 
     name = "simulated"
@@ -35,6 +36,8 @@ class SimulatedDevice:
         arch: str = "sm_90",
         mode: str = "count",
         seed: int = 0,
+        fuzz: bool = False,
+        budget: int | None = None,
         machine: Callable[[KernelInfo, int, int], Machine] | None = None,
     ) -> None:
         if mode not in MODES:
@@ -43,8 +46,14 @@ class SimulatedDevice:
             raise InputError(f"NVRTC cannot compile for {arch!r}: valid are {', '.join(known)}")
         if mode == "profile" and machine is None:
             raise InputError("mode 'profile' needs a machine to model")
-        self.arch, self.mode, self.seed, self.machine = arch, mode, seed, machine
+        self.arch, self.mode, self.seed, self.fuzz, self.budget = arch, mode, seed, fuzz, budget
+        self.machine = machine
         self._modules: dict[str, Any] = {}
+        self._written: Any = None  # debug: which bytes of fresh memory have been written
+        if mode == "debug":
+            from mpmbench.simt.checks import Written
+
+            self._written = Written()
 
     def upload(self, host: np.ndarray) -> np.ndarray:
         array = _aligned(host.shape, host.dtype)
@@ -55,6 +64,7 @@ class SimulatedDevice:
         array = _aligned(shape, np.dtype(dtype))
         if self.mode == "debug":
             array.reshape(-1).view(np.uint8)[...] = POISON
+            self._written.allocate(array)
         return array
 
     def download(self, array: np.ndarray) -> np.ndarray:
@@ -85,11 +95,20 @@ class SimulatedDevice:
     def launch(self, launch: Launch) -> LaunchReport:
         if self.mode == "profile":
             return self._profile(launch)
-        seed = {"seed": self.seed} if self.mode == "debug" else {}
+        options: dict[str, Any] = {}
+        if self.mode == "debug":
+            names = launch.names or parameter_names(launch.kernel.source.text, launch.kernel.entry)
+            options = {
+                "seed": self.seed,
+                "fuzz": self.fuzz,
+                "budget": self.budget,
+                "names": names,
+                "written": self._written,
+            }
         result = launch.kernel.handle.launch(
-            launch.grid, launch.block, launch.args, shared_bytes=launch.shared_bytes, **seed
+            launch.grid, launch.block, launch.args, shared_bytes=launch.shared_bytes, **options
         )
-        return LaunchReport(result.counters, result.findings)
+        return LaunchReport(result.counters, result.findings, result.notes)
 
     def _profile(self, launch: Launch) -> LaunchReport:
         assert self.machine is not None
@@ -112,7 +131,7 @@ class SimulatedDevice:
             result.memory,
             result.opcodes,
         )
-        return LaunchReport(result.counters, result.findings, (profile,))
+        return LaunchReport(result.counters, result.findings, profiles=(profile,))
 
     def synchronize(self) -> None:
         """Launches return when they are done."""

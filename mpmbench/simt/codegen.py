@@ -42,7 +42,7 @@ class KernelCode:
     sites: list[Site]
     counter_words: int
     hardware_ftz: bool
-    shared_granule: int = 4  # bytes: the narrowest element that the kernel accesses in shared memory
+    shared_granule: int = 4  # bytes: the narrowest access of the kernel to shared memory
     lines: list[tuple[str, int] | None] = field(default_factory=list)  # of the instructions
 
 
@@ -61,6 +61,8 @@ class _Generator:
         self.counts, self.traces = mode in ("count", "profile"), mode == "profile"
         self.w = Writer(lanes)
         self.lanes = lanes
+        # Debug: adds that run together with the next one.
+        self.unbroken = codegen_memory.joined_adds(kernel.instructions) if mode == "debug" else frozenset()
         self.segments = self._segments()
         self.forms = AddressForms(kernel.instructions)
         self.sites: list[Site] = []
@@ -85,7 +87,7 @@ class _Generator:
     def _ends_segment(self, item: Instruction) -> bool:
         if codegen_warp.is_collective(item) or codegen_warp.is_barrier(item):
             return True
-        if self.mode != "debug" or item.root not in ("ld", "st", "atom", "red"):
+        if self.mode != "debug" or item.root not in ("ld", "st", "atom", "red") or id(item) in self.unbroken:
             return False
         # Debug: other warps get a turn after every access to shared memory.
         return not {"global", "local", "const", "param"} & set(item.modifiers)
@@ -190,7 +192,7 @@ class _Generator:
         launch = scheduler.launch_text(self.context_bytes, self.hardware_ftz, self.mode == "debug")
         resume = scheduler.resume_text(self.hardware_ftz) if self.traces else ""
         text = "\n".join([*w.declarations.values(), *function, launch, resume])
-        widths = [site.element for site in self.sites if site.space in ("shared", "generic")]
+        widths = [site.width for site in self.sites if site.space in ("shared", "generic")]
         return KernelCode(
             self.kernel.name,
             text,
@@ -205,8 +207,22 @@ class _Generator:
 
     def _end(self) -> list[str]:
         """The kernel's last code. Lanes that wait for others now do so in vain."""
+        if self.mode == "debug" and self.segments:
+            # Lanes that a random choice has put off go first.
+            return [
+                "ended:",
+                f"%end.aside.at = getelementptr i8, ptr %context, i64 {scheduler.CONTEXT_SET_ASIDE}",
+                "%end.aside = load i16, ptr %end.aside.at, align 2",
+                "store i16 0, ptr %end.aside.at, align 2",
+                "%end.none.aside = icmp eq i16 %end.aside, 0",
+                f"br i1 %end.none.aside, label %really.ended, label %{self.chain(0)}",
+                *self._really_end("really.ended"),
+            ]
+        return self._really_end("ended")
+
+    def _really_end(self, label: str) -> list[str]:
         if not any(codegen_warp.gathers(item) for item in self.kernel.instructions):
-            return ["ended:", f"ret i32 {scheduler.STATUS_ENDED}"]
+            return [f"{label}:", f"ret i32 {scheduler.STATUS_ENDED}"]
 
         def field(name: str, offset: int) -> list[str]:
             return [
@@ -215,7 +231,7 @@ class _Generator:
             ]
 
         return [
-            "ended:",
+            f"{label}:",
             *field("end.live", scheduler.CONTEXT_LIVE),
             "%end.none = icmp eq i32 %end.live, 0",
             "br i1 %end.none, label %end.all, label %end.waiting",
@@ -558,22 +574,28 @@ class SegmentBody:
         return memory
 
     def check(self, site: Site, buffer: str, displacement: int, base: str, fingerprints: str) -> None:
-        """Ask the checker which of the lanes may go on. fingerprints: of what the lanes store, or null."""
+        """Let only the lanes go on that pass the check. fingerprints: of what the lanes store, or null."""
+        w = self.w
+        passed = self.ask([site], buffer, displacement, base, self.active_bits(), fingerprints)
+        narrow = passed if w.lanes == 32 else w.value(f"trunc i32 {passed} to i{w.lanes}")
+        mask = w.value(f"bitcast i{w.lanes} {narrow} to {w.vector('i1')}")
+        self.checked = (mask, mask)
+
+    def ask(
+        self, sites: list[Site], buffer: str, displacement: int, base: str, bits: str, fingerprints: str = "null"
+    ) -> str:
+        """Which of the chunk's lanes may go on, as bits of an i32. sites: of a run, the first of which names it."""
         w, g = self.w, self.g
         number = len(g.sites)
-        g.sites.append(site)
-        bits = self.active_bits()
+        g.sites.extend(sites)
         checker, data = g.job_field("check", pointer=True), g.job_field("check_data", pointer=True)
         absolute = f"{displacement}"
         if base != "null":
             absolute = w.value(f"add i64 {g.job_field('shared')}, {displacement}")
-        passed = w.value(
+        return w.value(
             f"call i32 {checker}(ptr {data}, ptr %job, ptr %context, i64 {number}, i64 %lane.{self.number}, "
             f"i32 {bits}, ptr {self.chunk_of(buffer)}, i64 {absolute}, ptr {fingerprints})"
         )
-        narrow = passed if w.lanes == 32 else w.value(f"trunc i32 {passed} to i{w.lanes}")
-        mask = w.value(f"bitcast i{w.lanes} {narrow} to {w.vector('i1')}")
-        self.checked = (mask, mask)
 
     # --- the body ---
 
@@ -622,6 +644,8 @@ class SegmentBody:
         elif item.root in _NOTHING:
             if item.root in ("membar", "fence"):
                 codegen_memory.flush_deferred(self)
+                if self.checks and {"gl", "sys", "gpu"} & set(item.modifiers):
+                    self.w.store("i16", "1", self.w.at("%context", scheduler.CONTEXT_FENCED), 2)
         elif codegen_rare.emit(self, item):
             pass
         elif item.root in EMITTERS:
@@ -841,6 +865,8 @@ class _Segment:
                 w.emit(f"br label %run{target}")
             else:
                 all_here = w.value(f"icmp eq i32 {mask}, {self._live()}")
+                if g.mode == "debug":
+                    self._choose(w.value(f"xor i1 {all_here}, true"), f"run{target}")
                 w.emit(f"br i1 {all_here}, label %run{target}, label %{g.chain(n + 1)}")
             return
         taken = self._guard_bits(mask)
@@ -852,6 +878,9 @@ class _Segment:
             self._add_pending(n + 1, stay)
         some = w.value(f"icmp ne i32 {taken}, 0")
         rest = g.chain(n + 1)
+        if g.mode == "debug" and target < count:
+            part = w.value(f"and i1 {some}, {w.value(f'icmp ne i32 {stay}, 0')}")
+            self._choose(part, rest if backward else f"run{target}")
         if backward:
             w.emit(f"br i1 {some}, label %back{n}, label %{rest}")
             w.label(f"back{n}")
@@ -862,6 +891,22 @@ class _Segment:
             w.emit(f"br i1 {all_there}, label %run{target}, label %{rest}")
         else:
             w.emit(f"br label %{rest}")
+
+    def _choose(self, parted: str, unusual: str) -> None:
+        """Where lanes have parted, let a random bit choose another way to go on; who is passed over goes at the end."""
+        w, n = self.w, self.number
+        w.emit(f"br i1 {parted}, label %part{n}, label %usual{n}")
+        w.label(f"part{n}")
+        state = w.load("i64", w.at("%job", JOB["random"]), 8)
+        for shift, amount in (("shl", 13), ("lshr", 7), ("shl", 17)):
+            state = w.value(f"xor i64 {state}, {w.value(f'{shift} i64 {state}, {amount}')}")
+        w.store("i64", state, w.at("%job", JOB["random"]), 8)
+        bits = w.value(f"and i64 {state}, {w.load('i64', w.at('%job', JOB['split_mask']), 8)}")
+        w.emit(f"br i1 {w.value(f'icmp eq i64 {bits}, 0')}, label %unusual{n}, label %usual{n}")
+        w.label(f"unusual{n}")
+        w.store("i16", "1", w.at("%context", scheduler.CONTEXT_SET_ASIDE), 2)
+        w.emit(f"br label %{unusual}")
+        w.label(f"usual{n}")
 
     def _spend(self, target: int) -> None:
         """A backward branch pays for the instructions it is about to repeat."""

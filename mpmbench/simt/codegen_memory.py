@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Container, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from mpmbench.simt.codegen_arith import ELEMENT, Refused, flush, is_float, is_signed
@@ -41,6 +41,7 @@ class Access:
     operation: str  # of atomics: add, cas, ...
     kind: str  # type of one element
     count: int  # elements: 1, 2 or 4
+    order: str = "weak"  # as of a Site
 
     @property
     def width(self) -> int:
@@ -62,7 +63,13 @@ def access_of(item: Instruction) -> Access:
             operation = flag
         elif not _HINTS.match(flag):
             raise Refused
-    return Access(space, operation, kind, count)
+    return Access(space, operation, kind, count, _order(flags))
+
+
+def _order(flags: Sequence[str]) -> str:
+    if {"release", "acq_rel"} & set(flags):
+        return "release"
+    return "strong" if {"volatile", "relaxed", "acquire", "mmio"} & set(flags) else "weak"
 
 
 _ATOMIC = frozenset({"add", "min", "max", "inc", "dec", "and", "or", "xor", "exch", "cas"})
@@ -77,6 +84,8 @@ class Site:
     space: str
     width: int  # bytes per lane
     element: int  # bytes of one element
+    order: str = "weak"  # weak, strong (volatile, relaxed, acquire), or release: strong with a fence before it
+    run: int = 1  # neighbouring accesses, one site each, that are checked in one go with this one
 
 
 @dataclass
@@ -211,7 +220,7 @@ def _account(
         return
     buffer, displacement, base, _, _ = _address_buffer(ctx, index, access.space, address)
     element = ELEMENT_BYTES[ELEMENT[access.kind]]
-    site = Site(index, kind, access.space, access.width, element)
+    site = Site(index, kind, access.space, access.width, element, access.order)
     if ctx.counts:
         ctx.observe_run([site], buffer, displacement)
     else:
@@ -583,9 +592,6 @@ def _defer_add(ctx: SegmentBody, index: int, access: Access, address: Address, o
     if ELEMENT_BYTES[ELEMENT[access.kind]] < 4:
         raise Refused
     value = ctx.read(operand, access.kind)
-    if ctx.checks:
-        flush_deferred(ctx)
-        _account(ctx, index, "atomic", access, address)
     buffer, displacement, base, key, constant = _address_buffer(ctx, index, access.space, address)
     entry = Deferred(index, access, (key, access.kind), constant, value, buffer, displacement, base, ctx.active_bits())
     ctx.deferred.append(entry)
@@ -601,7 +607,7 @@ def flush_deferred(ctx: SegmentBody) -> None:
         by_mask.setdefault(run[0].mask, []).append(run)
         _count_run(ctx, run)
     for mask, runs in by_mask.items():
-        _add_runs(ctx, mask, runs)
+        _add_runs(ctx, _check_runs(ctx, mask, runs) if ctx.checks else mask, runs)
 
 
 def ordered_starts(instructions: Sequence[Instruction], borders: Container[int]) -> set[int]:
@@ -639,6 +645,30 @@ def ordered_starts(instructions: Sequence[Instruction], borders: Container[int])
     return starts
 
 
+def joined_adds(instructions: Sequence[Instruction]) -> frozenset[int]:
+    """Adds that may be put off until another one follows, by ``id``: all but the last of at most four in a row."""
+    read = {reg for item in instructions for reg in item.reads()}
+    joined: set[int] = set()
+    last, length = None, 0
+    for item in instructions:
+        if item.root in ("atom", "red") and "add" in item.modifiers and not any(dst in read for dst in item.dsts):
+            if last is not None and length < _JOINED:
+                joined.add(id(last))
+                length += 1
+            else:
+                length = 1
+            last = item
+        elif item.root in _BREAKS:
+            last, length = None, 0
+    return frozenset(joined)
+
+
+_JOINED = 4
+_BREAKS = frozenset(
+    {"ld", "st", "atom", "red", "bra", "brx", "bar", "barrier", "membar", "fence", "ret", "exit", "trap", "shfl"}
+)
+
+
 def _sees_deferred(item: Instruction) -> bool:
     """Whether a load or store must find the adds that were put off carried out."""
     if item.root not in ("ld", "st") or {"param", "const"} & set(item.modifiers):
@@ -652,6 +682,21 @@ def _count_run(ctx: SegmentBody, run: list[Deferred]) -> None:
     first = run[0]
     sites = [Site(entry.index, "atomic", entry.access.space, entry.access.width, entry.access.width) for entry in run]
     ctx.observe_run(sites, first.buffer, first.displacement, first.mask)
+
+
+def _check_runs(ctx: SegmentBody, mask: str, runs: list[list[Deferred]]) -> str:
+    """The lanes that may carry out these adds: those that pass the check of every run."""
+    passed = mask
+    for run in runs:
+        first = run[0]
+        sites = [
+            Site(entry.index, "atomic", entry.access.space, entry.access.width, entry.access.width, entry.access.order)
+            for entry in run
+        ]
+        sites[0] = replace(sites[0], run=len(run))
+        allowed = ctx.ask(sites, first.buffer, first.displacement, first.base, mask)
+        passed = ctx.w.value(f"and i32 {passed}, {allowed}")
+    return passed
 
 
 def _runs(entries: list[Deferred]) -> list[list[Deferred]]:

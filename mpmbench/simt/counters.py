@@ -64,11 +64,16 @@ class Counters:
         return Counters(self.total + other.total, lines)
 
 
+# How grave a finding is. INFO: the outcome is the same, whoever comes last.
+ERROR, WARNING, INFO = "ERROR", "WARNING", "INFO"
+
+
 @dataclass(frozen=True)
 class Finding:
     """A defect that the engine saw while it ran a kernel.
 
-    kind: race, uninitialised, out-of-bounds, misaligned, divergent-barrier, bad-mask, runaway.
+    kind: race, global-race, atomic-mix, equal-stores, uninitialised, out-of-bounds, misaligned, divergent-barrier,
+    bad-mask, runaway, trap.
     """
 
     kind: str
@@ -77,3 +82,6 @@ class Finding:
     line: SourceLine | None = None
     other_line: SourceLine | None = None
     count: int = 1
+    severity: str = ERROR
+    threads: str = ""  # threads and blocks of the first occurrence
+    place: str = ""  # array and offset, or address space and offset, of the first occurrence

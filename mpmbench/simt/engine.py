@@ -16,17 +16,20 @@ import functools
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mpmbench.errors import InputError
-from mpmbench.simt import cache, codegen_count, native, ptx, scheduler
+from mpmbench.simt import cache, codegen_count, naming, native, ptx, scheduler
 from mpmbench.simt.codegen import MODES, KernelCode, generate
 from mpmbench.simt.codegen_memory import SINK_BYTES, SINK_REACH, Site
-from mpmbench.simt.counters import Counters, Finding, SourceLine
+from mpmbench.simt.counters import INFO, Counters, Finding, SourceLine
 from mpmbench.simt.machine import Machine, MemoryCounters
 from mpmbench.simt.tally import counters_from, opcodes_from
+
+if TYPE_CHECKING:
+    from mpmbench.simt.checks import Written
 
 __all__ = ["DEFAULT_BUDGET", "Kernel", "LaunchResult", "Module", "compile_ptx"]
 
@@ -39,7 +42,8 @@ _MAX_SHARED = 227 * 1024  # of the largest GPU (Hopper)
 
 @dataclass(frozen=True)
 class LaunchResult:
-    """counters: in modes ``count`` and ``profile``; findings: defects seen, in any mode. memory: in mode ``profile``.
+    """counters: in modes ``count`` and ``profile``; findings: defects seen, in any mode.
+    notes: findings that are INFO, no defects. memory: in mode ``profile``.
 
     opcodes: how often warps executed each PTX opcode with each integer literal (None: without), where counters are
     kept.
@@ -47,6 +51,7 @@ class LaunchResult:
 
     counters: Counters | None
     findings: tuple[Finding, ...]
+    notes: tuple[Finding, ...] = ()
     memory: MemoryCounters | None = None
     opcodes: Mapping[tuple[str, int | None], int] = field(default_factory=dict)
 
@@ -145,6 +150,9 @@ class Kernel:
         seed: int | None = None,
         budget: int | None = None,
         allocations: Sequence[np.ndarray] = (),
+        fuzz: bool = False,
+        names: Sequence[str] = (),
+        written: Written | None = None,
         machine: Machine | None = None,
     ) -> LaunchResult:
         """Run the kernel.
@@ -152,7 +160,9 @@ class Kernel:
         grid, block: thread blocks and threads per axis (x, y, z). args: C-contiguous NumPy arrays, which are the
         memory itself, NumPy scalars, and structured NumPy scalars passed by value. shared_bytes: dynamic shared
         memory. seed: of the warp order in mode debug. budget: warp instructions that loops may repeat. allocations:
-        further arrays that pointers inside structures may point to. machine: what mode profile models.
+        further arrays that pointers inside structures may point to. fuzz: in mode debug, let lanes that part run in a
+        random order too, instead of the lower program counter first. names: of the arguments, for findings. written:
+        which memory is known to be uninitialised (debug). machine: what mode profile models.
         """
         job = _Job(self.module, self.facts, _three(grid, "grid"), _three(block, "block"), shared_bytes, self.name)
         job.set_arguments(args)
@@ -161,7 +171,8 @@ class Kernel:
         if self.module.mode == "debug":
             from mpmbench.simt.checks import Checker
 
-            checker = Checker(self.facts, job, [*args, *allocations], 0 if seed is None else seed)
+            job.set("split_mask", scheduler.OFTEN_SPLIT if fuzz else scheduler.NEVER_SPLIT)
+            checker = Checker(self.facts, job, [*args, *allocations], seed or 0, names, written)
         memory = None
         if self.module.mode == "profile" and job.threads:
             status, memory = self._profile(job, machine, [*args, *allocations])
@@ -170,10 +181,12 @@ class Kernel:
         findings = _faults(self.name, self.facts, job, status)
         if checker is not None:
             findings += checker.findings(self.name)
+        notes = tuple(finding for finding in findings if finding.severity == INFO)
+        defects = tuple(finding for finding in findings if finding.severity != INFO)
         if self.module.mode not in ("count", "profile"):
-            return LaunchResult(None, tuple(findings))
+            return LaunchResult(None, defects, notes)
         counters = counters_from(self.facts, job.counters)
-        return LaunchResult(counters, tuple(findings), memory, opcodes_from(self.facts, job.counters))
+        return LaunchResult(counters, defects, notes, memory, opcodes_from(self.facts, job.counters))
 
     def _profile(self, job: _Job, machine: Machine | None, arguments: Sequence[Any]) -> tuple[int, MemoryCounters]:
         """Run all thread blocks on a modelled machine."""
@@ -313,19 +326,24 @@ def _faults(name: str, facts: _Description, job: _Job, status: int) -> list[Find
     if status == 0:
         return []
     kind, text = {
-        scheduler.FAULT_DIVERGENT_BARRIER: ("divergent-barrier", "only some lanes of a warp reach a barrier"),
+        scheduler.FAULT_DIVERGENT_BARRIER: (
+            "divergent-barrier",
+            "Divergent thread(s) in warp: only some lanes of a warp reach the barrier",
+        ),
         scheduler.FAULT_BUDGET: ("runaway", "a loop spends the instruction budget"),
         scheduler.FAULT_TRAP: ("trap", "the kernel executes a trap"),
         scheduler.FAULT_MASK: (
             "bad-mask",
-            "a warp operation's member mask does not match the lanes that execute it",
+            "Invalid arguments: the member mask of a warp operation does not match the lanes that execute it",
         ),
     }[status]
-    segment = job.get("stop_segment")
+    segment, warp = job.get("stop_segment"), job.get("stop_warp")
     line = line_of(facts, facts.segments[segment][1] - 1)
-    where = f"{line.file}:{line.line}" if line else "unknown line"
-    message = f"{name}: {text} ({where}, thread block {job.get('block')}, warp {job.get('stop_warp')}); launch stopped"
-    return [Finding(kind, name, message, line)]
+    context = job.contexts[warp * facts.context_bytes :][: facts.context_bytes].view(np.uint32)
+    waiting, live = int(context[scheduler.CONTEXT_SLOTS // 4 + segment]), int(context[scheduler.CONTEXT_LIVE // 4])
+    threads = f"{naming.threads_text(job, warp, waiting or live)} in block {naming.block_text(job, job.get('block'))}"
+    message = f"{name}: {text} at {naming.line_text(line)} by {threads}; launch stopped"
+    return [Finding(kind, name, message, line, threads=threads)]
 
 
 def line_of(facts: _Description, instruction: int) -> SourceLine | None:

@@ -50,6 +50,7 @@ _COLLECTIVE = frozenset({"shfl", "vote", "match", "redux", "elect"})
 class Result:
     counters: Counters
     findings: tuple[Finding, ...] = ()
+    notes: tuple[Finding, ...] = ()
 
 
 def run(

@@ -49,6 +49,14 @@ JOB_FIELDS = (
     "arrived_1",
     "votes_2",
     "arrived_2",
+    "stranded_block",  # first thread block that was stranded,
+    "stranded_waiting",  # and its warps that waited, as bits (debug)
+    "mixed",  # barriers at which warps of a thread block waited in different places (debug),
+    "mixed_block",
+    "mixed_segment",
+    "mixed_other",
+    "split_mask",  # where lanes part, they do so in the unusual order if these bits of ``random`` are zero (debug)
+    "wake_last",  # scratch: where the warp waited that was woken last, or -1 (debug)
 )
 JOB = {name: 8 * position for position, name in enumerate(JOB_FIELDS)}
 JOB_BYTES = 8 * len(JOB_FIELDS)
@@ -65,6 +73,8 @@ CONTEXT_REDUCTIONS = 40  # i64: reducing barriers that the warp has arrived at i
 CONTEXT_WAITED = 48  # i32: lanes that others have waited for and that have not come yet
 CONTEXT_STUCK = 52  # i32: status to end with if those never come,
 CONTEXT_STUCK_SEGMENT = 56  # i32: and the segment where the others wait
+CONTEXT_SET_ASIDE = 60  # i16: whether a random choice has put lanes off (debug)
+CONTEXT_FENCED = 62  # i16: whether the warp has passed a fence since its last plain store to global memory (debug)
 CONTEXT_TID = 64  # 3 x 32 x i32
 CONTEXT_CLOCK = CONTEXT_TID + 3 * 128  # i64: cycles that the warp's instructions took, waits for memory apart (profile)
 CONTEXT_TRACE = CONTEXT_CLOCK + 8  # i64: where its next request is recorded (profile),
@@ -88,6 +98,8 @@ FAULT_MASK = 7
 FIRST_FAULT = FAULT_DIVERGENT_BARRIER
 
 ISSUE_UNITS = 1024  # parts of a cycle, fixed point
+NEVER_SPLIT = -1  # split masks: the state of the generator is never zero;
+OFTEN_SPLIT = 1 << 40  # every other parting
 
 POISON = 0xFF  # 0xFFFFFFFF is a NaN, as a number it is -1
 
@@ -161,6 +173,8 @@ start:
   %live = select i1 %is.full, i32 -1, i32 %tail.mask
   %start.reductions = getelementptr i8, ptr %start.context, i64 {CONTEXT_REDUCTIONS}
   store i64 0, ptr %start.reductions
+  %start.flags = getelementptr i8, ptr %start.context, i64 {CONTEXT_SET_ASIDE}
+  store i32 0, ptr %start.flags
   store i32 0, ptr %start.context
   store i32 %live, ptr %start.live
   store i32 {READY}, ptr %start.state
@@ -350,9 +364,17 @@ strand:
   %stranded.old = load i64, ptr %stranded.field
   %stranded.new = add i64 %stranded.old, 1
   store i64 %stranded.new, ptr %stranded.field
+  %stranded.block.field = getelementptr i8, ptr %job, i64 @stranded_block@
+  %stranded.block.old = load i64, ptr %stranded.block.field
+  %stranded.first = icmp eq i64 %stranded.old, 0
+  %stranded.block.new = select i1 %stranded.first, i64 %b, i64 %stranded.block.old
+  store i64 %stranded.block.new, ptr %stranded.block.field
   br label %wake.start
 
 wake.start:
+  %wake.first = phi i1 [ false, %release ], [ %stranded.first, %strand ]
+  %wake.last.field = getelementptr i8, ptr %job, i64 @wake_last@
+  store i64 -1, ptr %wake.last.field
   br label %wake
 
 wake:
@@ -374,6 +396,30 @@ wake.up:
   %wake.kept = load i64, ptr %stranded.segment.field
   %wake.noted = select i1 %some.ended, i64 %wake.segment, i64 %wake.kept
   store i64 %wake.noted, ptr %stranded.segment.field
+  %wake.waiting.field = getelementptr i8, ptr %job, i64 @stranded_waiting@
+  %wake.waiting.old = load i64, ptr %wake.waiting.field
+  %wake.bit = shl i64 1, %wake.w
+  %wake.bit.kept = select i1 %wake.first, i64 %wake.bit, i64 0
+  %wake.waiting = or i64 %wake.waiting.old, %wake.bit.kept
+  store i64 %wake.waiting, ptr %wake.waiting.field
+  %wake.last = load i64, ptr %wake.last.field
+  store i64 %wake.segment, ptr %wake.last.field
+  %wake.any = icmp ne i64 %wake.last, -1
+  %wake.differs = icmp ne i64 %wake.last, %wake.segment
+  %wake.mixed = and i1 %wake.any, %wake.differs
+  br i1 %wake.mixed, label %wake.mix, label %wake.done
+
+wake.mix:
+  %mixed.field = getelementptr i8, ptr %job, i64 @mixed@
+  %mixed.old = load i64, ptr %mixed.field
+  %mixed.new = add i64 %mixed.old, 1
+  store i64 %mixed.new, ptr %mixed.field
+  %mixed.block.field = getelementptr i8, ptr %job, i64 @mixed_block@
+  store i64 %b, ptr %mixed.block.field
+  %mixed.segment.field = getelementptr i8, ptr %job, i64 @mixed_segment@
+  store i64 %wake.segment, ptr %mixed.segment.field
+  %mixed.other.field = getelementptr i8, ptr %job, i64 @mixed_other@
+  store i64 %wake.last, ptr %mixed.other.field
   br label %wake.done
 
 wake.done:
