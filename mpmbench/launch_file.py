@@ -114,6 +114,9 @@ def read_launch_file(path: Path) -> LaunchFile:
     )
 
 
+_KIND_NAMES = {"str": "text", "list": "list", "dict": "table"}
+
+
 class _Table:
     """A TOML table that knows where it stands."""
 
@@ -129,8 +132,7 @@ class _Table:
         if value is ...:
             raise InputError(f"{self.where}: {key} is missing")
         if key in self.content and not isinstance(value, kind):
-            wanted = {str: "a text", list: "a list", dict: "a table"}[kind]
-            raise InputError(f"{self.where}: {key} must be {wanted}, not {value!r}")
+            raise InputError(f"{self.where}: {key} must be a {_KIND_NAMES[kind.__name__]}, not {value!r}")
         return value
 
     def sub(self, key: str) -> _Table:

@@ -210,9 +210,18 @@ def _look_at_shared(data, job, offset, width, kind, site, warp, lane, warp_epoch
     block = job[_BLOCK]
     epoch = job[_EPOCH]
     shift = data[_GRANULE_SHIFT]
+    who = (warp_epoch << 8) | (warp + 1)
     against = 6 if kind == _LOAD else 7 if kind == _STORE else 3
     for granule in range(offset >> shift, ((offset + width - 1) >> shift) + 1):
         shadow = data[_SHADOW_AT] + granule * _SHADOW_WORDS
+        if kind != _STORE and data[shadow] == ((epoch << 3) | (1 << kind)) and data[shadow + 1] == block + 1:
+            # Nothing but this kind of access in this epoch: no conflict, and this warp may be noted already.
+            slot = shadow + _SLOTS + 2 * kind * _SLOT_WORDS
+            if data[slot + 1] != who:
+                slot += _SLOT_WORDS
+            if data[slot + 1] == who:
+                data[slot] |= np.int64(1) << lane
+                continue
         if data[shadow + 1] != block + 1:
             if kind != _STORE:
                 _report(data, _UNINITIALISED, site, np.int64(-1), block, granule << shift, warp, lane, block, 0, 0)
