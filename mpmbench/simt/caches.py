@@ -6,16 +6,14 @@ recently used, four bits each), and per line the bits of its sectors: valid belo
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import fields
-from typing import Any
 
-import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
+from mpmbench.simt.compiled import inlined
 from mpmbench.simt.machine import MemoryTally
 
 WAYS = 16
@@ -26,19 +24,6 @@ _HASH = np.uint64(0x9E3779B97F4A7C15)
 _U4, _U32, _U60 = np.uint64(4), np.uint64(32), np.uint64(60)
 _ONE, _ZERO, _ALL = np.uint64(1), np.uint64(0), np.uint64(0xFFFFFFFFFFFFFFFF)
 _EACH, _TOP = np.uint64(0x1111111111111111), np.uint64(0x8888888888888888)
-
-
-def compiled(function: Callable[..., Any]) -> Any:
-    """Compile, and keep the result where numba finds a folder for it."""
-    try:
-        return numba.njit(cache=True, nogil=True, error_model="numpy")(function)
-    except RuntimeError:  # neither the package's folder nor the user's cache can be written
-        return numba.njit(nogil=True, error_model="numpy")(function)
-
-
-def inlined(function: Callable[..., Any]) -> Any:
-    """A part of a compiled function: a call that passes arrays costs more than most of these parts do."""
-    return numba.njit(inline="always", error_model="numpy")(function)
 
 
 @intrinsic

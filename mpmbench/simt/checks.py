@@ -14,21 +14,21 @@ after a fence.
 Uninitialised: a byte is read that nobody has written since its thread block started (shared, local) or since it was
 allocated (global).
 
-The checker is compiled by numba and kept in numba's own cache.
+The checker is compiled by numba (``compiled``).
 """
 
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-import numba
 import numpy as np
 from numba import types
 from numba.extending import intrinsic
 
+from mpmbench.simt.compiled import callback, compiled
 from mpmbench.simt.counters import ERROR, INFO, WARNING, Finding, SourceLine
 from mpmbench.simt.naming import block_text, line_text, threads_text
 from mpmbench.simt.scheduler import CONTEXT_FENCED, CONTEXT_WARP, CONTEXT_WARP_EPOCH, JOB
@@ -85,21 +85,6 @@ _WORD = types.CPointer(types.int64)
 _SIGNATURE = types.int32(_WORD, _WORD, _WORD, types.int64, types.int64, types.int32, _WORD, types.int64, _WORD)
 
 
-def _compiled(function: Callable[..., Any]) -> Any:
-    """Compile, and keep the result where numba finds a folder for it."""
-    try:
-        return numba.njit(cache=True)(function)
-    except RuntimeError:  # neither the package's folder nor the user's cache can be written
-        return numba.njit(function)
-
-
-def _callback(function: Callable[..., Any]) -> Any:
-    try:
-        return numba.cfunc(_SIGNATURE, cache=True)(function)
-    except RuntimeError:
-        return numba.cfunc(_SIGNATURE)(function)
-
-
 def _pointer_to(element: types.Type) -> Any:
     @intrinsic
     def at(typing_context, address):
@@ -116,7 +101,7 @@ _bytes = _pointer_to(types.uint8)
 _stamps = _pointer_to(types.int32)
 
 
-@_compiled
+@compiled
 def _report(data, kind, site, other, block, address, warp, lane, other_block, other_warp, other_lanes):
     start = data[_FINDINGS_AT]
     count = data[_FINDING_COUNT]
@@ -143,7 +128,7 @@ def _report(data, kind, site, other, block, address, warp, lane, other_block, ot
         data[_FINDING_COUNT] = count + 1
 
 
-@_compiled
+@compiled
 def _range_of(data, address, width):
     """Place of the allocation that holds the bytes in the table of ranges, or -1."""
     at = data[_RANGES_AT]
@@ -157,7 +142,7 @@ def _range_of(data, address, width):
 # --- shared memory ----------------------------------------------------------------------------------------------------
 
 
-@_compiled
+@compiled
 def _compare(data, shadow, other, kind, site, warp, lane, warp_epoch, stored, block, address):
     """Report conflicts of an access with the earlier ones of one kind in this epoch."""
     for number in range(2):
@@ -184,7 +169,7 @@ def _compare(data, shadow, other, kind, site, warp, lane, warp_epoch, stored, bl
         return
 
 
-@_compiled
+@compiled
 def _remember(data, shadow, kind, fresh, site, warp, lane, warp_epoch, stored):
     """Two different warps are enough to find every race with a third; of one warp, the lanes since its last barrier."""
     first = shadow + _SLOTS + 2 * kind * _SLOT_WORDS
@@ -205,7 +190,7 @@ def _remember(data, shadow, kind, fresh, site, warp, lane, warp_epoch, stored):
         data[shadow + _STORED + chosen] = stored
 
 
-@_compiled
+@compiled
 def _look_at_shared(data, job, offset, width, kind, site, warp, lane, warp_epoch, stored):
     block = job[_BLOCK]
     epoch = job[_EPOCH]
@@ -239,7 +224,7 @@ def _look_at_shared(data, job, offset, width, kind, site, warp, lane, warp_epoch
 # --- global memory ----------------------------------------------------------------------------------------------------
 
 
-@_compiled
+@compiled
 def _fingerprint(address, width, element):
     """Of what memory holds, as stores compute it of what they write."""
     memory = _bytes(address)
@@ -252,14 +237,14 @@ def _fingerprint(address, width, element):
     return np.int64(total)
 
 
-@_compiled
+@compiled
 def _deed(kind, plain):
     if plain:
         return _READ if kind == _LOAD else _WRITTEN
     return _STRONG_READ if kind == _LOAD else _ATOMICALLY
 
 
-@_compiled
+@compiled
 def _between_blocks(data, context, shadow, granule, kind, order, site, warp, lane, block, address, width, element,
                     stored):  # fmt: skip
     """An access to a granule that this block does not have to itself, or does something new to."""
@@ -303,7 +288,7 @@ def _between_blocks(data, context, shadow, granule, kind, order, site, warp, lan
     shadow[granule] = word | does
 
 
-@_compiled
+@compiled
 def _look_at_written(data, kind, site, width, address, start, bits, warp, lane, block):
     """Bytes that are read must have been written; those that are written, have. One bit per byte."""
     memory = _bytes(bits)
@@ -331,7 +316,7 @@ def _look_at_written(data, kind, site, width, address, start, bits, warp, lane, 
         _report(data, _UNINITIALISED, site, np.int64(-1), block, address, warp, lane, block, 0, 0)
 
 
-@_compiled
+@compiled
 def _look_at_local(data, kind, site, width, offset, warp, lane, block, address):
     stamps = _stamps(data[_LOCAL_AT])
     shift = data[_LOCAL_SHIFT]
@@ -348,7 +333,7 @@ def _look_at_local(data, kind, site, width, offset, warp, lane, block, address):
 # --- the check --------------------------------------------------------------------------------------------------------
 
 
-@_callback
+@callback(_SIGNATURE)
 def _check(data, job, context, site, first_lane, bits, addresses, displacement, stored_values):
     """-> the lanes that may go on. addresses: of the chunk's lanes, the first of which is ``first_lane``."""
     about = data[_SITES_AT] + site * _SITE_WORDS

@@ -30,8 +30,6 @@ from mpmbench.simt.caches import (
     PART,
     TALLY,
     WAYS,
-    compiled,
-    inlined,
     l1_access,
     l2_access,
     write_back,
@@ -44,6 +42,7 @@ from mpmbench.simt.codegen_trace import (
     RECORD_SITE,
     RECORD_WORDS,
 )
+from mpmbench.simt.compiled import compiled, inlined
 from mpmbench.simt.counters import SourceLine
 from mpmbench.simt.machine import Machine, MemoryCounters, MemoryTally
 from mpmbench.simt.scheduler import ISSUE_UNITS, JOB_BYTES
@@ -91,8 +90,8 @@ _READY, _REPLAYING, _WAITING, _ENDED = range(4)
 ) = range(14)  # fmt: skip
 
 # Columns of a slot's row: warps that run, warps that wait at a barrier; when the thread block started, and when its
-# last barrier opened.
-_RUNNING, _AT_BARRIER, _STARTED, _OPENED = range(4)
+# last barrier opened; whether it stands in the heap.
+_RUNNING, _AT_BARRIER, _STARTED, _OPENED, _QUEUED_SLOT = range(5)
 
 # Outcomes of a replay; the last one is followed by waits for L1, L2 and DRAM.
 _FAULT, _STOP_SLOT, _STOP_WARP, _LATENCY_CYCLES, _WARP_CYCLES, _BARRIER_WAIT, _PEAK_WARPS, _WAITS = range(8)
@@ -312,7 +311,7 @@ def replay(
     l1_latency, l2_latency, dram_latency = machine[_L1_LATENCY], machine[_L2_LATENCY], machine[_DRAM_LATENCY]
     total = slot_count * count
     warps = np.zeros((total, 14), np.int64)
-    slots = np.zeros((slot_count, 4), np.int64)
+    slots = np.zeros((slot_count, 5), np.int64)
     pending = np.zeros((total, _PENDING, 3), np.int64)
     saved = np.zeros((total, 64), np.int64)
     covered = np.zeros(64, np.int64)
@@ -333,6 +332,7 @@ def replay(
     for slot in range(slot_count):
         _push(heap, heap_size, slot - slot_count, total + slot)
         heap_size += 1
+        slots[slot, _QUEUED_SLOT] = 1
     outcome[_PEAK_WARPS] = total
 
     while heap_size > 0:
@@ -340,6 +340,7 @@ def replay(
         if warp >= total:
             # Run the code of every ready warp of a slot.
             slot = warp - total
+            slots[slot, _QUEUED_SLOT] = 0
             heap_size -= 1
             if heap_size > 0:
                 _replace_top(heap, heap_size, heap[heap_size, 0], heap[heap_size, 1])
@@ -454,8 +455,10 @@ def replay(
                 _replace_top(heap, heap_size, heap[heap_size, 0], heap[heap_size, 1])
             if warps[warp, _STATUS_OF] == _STATUS_YIELD:
                 warps[warp, _STATE] = _READY
-                _push(heap, heap_size, now, total + slot)
-                heap_size += 1
+                if not slots[slot, _QUEUED_SLOT]:
+                    _push(heap, heap_size, now, total + slot)
+                    heap_size += 1
+                    slots[slot, _QUEUED_SLOT] = 1
                 continue
             _arrive(warps, slots, pipes, contexts, pending, outcome, slot, sm, warp, warp * words)
 
@@ -492,6 +495,7 @@ def replay(
             next_block += 1
         _push(heap, heap_size, start + queued, total + slot)
         heap_size += 1
+        slots[slot, _QUEUED_SLOT] = 1
 
     for at in range(l2_bits.size):
         if l2_bits[at] >> 4:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from engine_programs import kernel
 
 from mpmbench.errors import InputError
-from mpmbench.simt import cache, native, nvrtc, ptx
+from mpmbench.simt import cache, checks, memory_system, native, nvrtc, ptx
 
 TEXT = 'extern "C" __global__ void kernel(int* o) { o[threadIdx.x] = 7 * threadIdx.x; }'
 
@@ -90,3 +92,10 @@ def test_the_default_folder_follows_the_user(monkeypatch, tmp_path):
     monkeypatch.delenv("MPMBENCH_CACHE_DIR", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert cache.cache_folder() == tmp_path / "mpmbench"
+
+
+def test_compiled_python_is_stale_when_any_file_of_the_folder_changes():
+    """Places in a job are compiled into it: a cache that looks at one file's date would write into wrong ones."""
+    stamp = cache.source_digest(Path(cache.__file__).parent)
+    for function in (memory_system.replay, checks._check):
+        assert function._cache._cache_file._source_stamp == stamp
