@@ -39,18 +39,20 @@ def terms(one: LaunchProfile, on: Gpu | None = None, rates: Rates = RATES) -> di
     return {name: value for name, value in found.items() if value}
 
 
-def test_issue_adds_up_classes_at_their_rates():
-    """fp32 runs at 4 per cycle, shifts at 2, conversions at 1: 0.25 + 0.5 + 1 cycles, over 0.5 x 10 SMs x 1 GHz."""
+def test_units_share_the_issue_slots_and_a_slow_one_can_bind():
+    """Slots: 4 schedulers at an efficiency of 0.5, so two instructions per cycle and SM. Conversions run at one."""
     opcodes = {("fma.rn.f32", None): 10_000, ("shl.b32", 2): 10_000, ("cvt.rn.f32.s32", None): 10_000}
-    assert terms(launch(opcodes=opcodes)) == {"issue": pytest.approx(10_000 * 1.75 / 0.5 / 10 / 1e9)}
+    assert terms(launch(opcodes=opcodes)) == {"issue": pytest.approx(30_000 / 2 / 10 / 1e9)}
+    slow = {**opcodes, ("cvt.rn.f32.s32", None): 40_000}
+    assert terms(launch(opcodes=slow)) == {"issue": pytest.approx(40_000 / 10 / 1e9)}
 
 
 def test_rounds_of_a_float_atomic_in_shared_memory_are_instructions_and_wavefronts():
     opcodes = {("atom.shared.add.f32", None): 100}
     few, many = (terms(launch(opcodes=opcodes, tally=Tally(satom_req=100, satom_iter=rounds))) for rounds in (100, 300))
     assert many["shared"] - few["shared"] == pytest.approx(3 * 200 / 10 / 1e9)
-    # Two loads or stores at one per cycle, an addition at four, a comparison at two, a branch at four.
-    assert many["issue"] - few["issue"] == pytest.approx(200 * (2 + 0.25 + 0.5 + 0.25) / 0.5 / 10 / 1e9)
+    # Five instructions a round, two per cycle.
+    assert many["issue"] - few["issue"] == pytest.approx(200 * 5 / 2 / 10 / 1e9)
     whole = {("atom.shared.add.u32", None): 100}
     assert terms(launch(opcodes=whole, tally=Tally(satom_req=100, satom_iter=300)))["issue"] < few["issue"]
 

@@ -70,7 +70,7 @@ def test_misses_are_sorted_and_every_scored_row_is_among_them_or_the_rest(docume
         "Table 12: G2P-global", "Table 14: global", "Table 8: Seq. (2x)"
     ]  # fmt: skip
     assert column(shown, "modelled / published", Kind.MODELLED) == pytest.approx([0.24, 0.47, 1.9])
-    assert "does not say in which order" in column(shown, "likely cause", Kind.NAME)[0]
+    assert "which it does not state" in column(shown, "likely cause", Kind.NAME)[0]
     assert len(shown.rows) + len(rest.tables[0].rows) == 45
 
 
