@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.table import Table as RichTable
@@ -23,8 +23,10 @@ from mpmbench.cli import (
 )
 from mpmbench.errors import InputError
 from mpmbench.gpu import Gpu, get_gpu, list_gpus
-from mpmbench.record import Record, RecordWriter, read_records
-from mpmbench.runner import Case, format_axis
+
+if TYPE_CHECKING:
+    from mpmbench.record import Record
+    from mpmbench.runner import Case
 
 
 def parse_gpus(names: Sequence[str]) -> list[Gpu]:
@@ -102,6 +104,7 @@ def profile(
 def model_cases(cases: Sequence[Any], gpus: Sequence[Gpu], json_path: Path | None, resume: bool) -> list[Record]:
     """Run, check and model cases; each record is in --json FILE before the next case begins."""
     from mpmbench.profile import profile_cases
+    from mpmbench.record import RecordWriter, read_records
 
     known = read_records(json_path) if resume and json_path is not None and json_path.exists() else []
     writer = RecordWriter(json_path, "append" if resume else "replace") if json_path else None
@@ -145,6 +148,8 @@ def _print_ncu(cases: Sequence[Any], gpus: Sequence[Gpu], variant_dirs: Sequence
 
 
 def _transfers(cases: Sequence[Any]) -> list[Case]:
+    from mpmbench.runner import Case
+
     if others := [case.name for case in cases if not isinstance(case, Case)]:
         raise InputError(f"Nsight Compute lines are for transfers, which are one kernel: leave out {others[0]}")
     return list(cases)
@@ -152,6 +157,7 @@ def _transfers(cases: Sequence[Any]) -> list[Case]:
 
 def _run_arguments(case: Case, variant_dirs: Sequence[Path]) -> list[str]:
     """What ``mpmbench run`` takes to repeat this case."""
+    from mpmbench.runner import format_axis
     from mpmbench.variants import resolve_axes
 
     choice, defaults = case.dataset, resolve_axes(case.variant, {})

@@ -20,6 +20,7 @@ from mpmbench.primitive_runs import PrimitiveCase
 from mpmbench.profile_record import LineProfile, Profile, Residency
 from mpmbench.record import Record
 from mpmbench.runner import Inputs, refuse_bad_input, resume_key, run_case
+from mpmbench.simt.codegen_trace import CAS_PASSES
 from mpmbench.simt.counters import SourceLine, Tally
 from mpmbench.simt.machine import MemoryTally
 
@@ -27,7 +28,7 @@ from mpmbench.simt.machine import MemoryTally
 _SHARE_OF: Mapping[str, Callable[[Tally, MemoryTally], int]] = {
     "issue": lambda tally, memory: tally.warp_inst,
     "latency": lambda tally, memory: tally.warp_inst,
-    "shared": lambda tally, memory: tally.shm_wavefronts + 3 * tally.satom_iter,
+    "shared": lambda tally, memory: tally.shm_wavefronts + CAS_PASSES * tally.satom_iter,
     "l1": lambda tally, memory: memory.l1_request_bytes,
     "l2": lambda tally, memory: memory.l2_sectors,
     "dram": lambda tally, memory: memory.dram_sectors,

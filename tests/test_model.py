@@ -142,6 +142,11 @@ def test_metrics_are_shares_of_peaks():
     assert found["l1_hit_percent"] == 25
     assert found["sm_percent"] == pytest.approx(100 * 500 / (10 * 320))
     assert found["dram_bytes"] == 32_000
+    slow = launch(opcodes={("cvt.rn.f32.s32", None): 2000})
+    shares = metrics_of(on, [slow], model_launch(on, slow, RATES))
+    assert (shares["sm_percent"], shares["sm_issue_percent"]) == pytest.approx((100, 25)), (
+        "its unit is all it waits for"
+    )
     assert metrics_of(on, [], time) == {}
 
 

@@ -29,6 +29,7 @@ from mpmbench.gpu import Gpu, get_gpu
 from mpmbench.gpu.machine import slot_cycles
 from mpmbench.gpu.modelled import TERMS, ModelledTime
 from mpmbench.gpu.sass import CAS_TRIP, is_shared_float_add, weight
+from mpmbench.simt.codegen_trace import CAS_PASSES
 
 SECTOR_BYTES = 32
 SM_TERMS = ("issue", "shared", "l1", "latency")
@@ -39,7 +40,6 @@ ATOMIC_RANGE = (0.5, 4.0)  # of one addition per cycle and L2 slice, where no ra
 ACTIVATION_RANGE = (0.5, 2.0)  # of the calibrated rate per bank, where no rate is known
 CALIBRATED_GPU = "gtx970"
 UNCALIBRATED_BANK = 1e7  # activations/s of a bank before anything was calibrated: one every 100 ns
-CAS_WAVEFRONTS = 3  # a round loads (1) and swaps (2)
 
 
 @dataclass(frozen=True)
@@ -103,15 +103,18 @@ def instruction_counts(gpu: Gpu, launch: LaunchProfile) -> dict[str, float]:
     return counts
 
 
-def issue_cycles(gpu: Gpu, launch: LaunchProfile) -> float:
-    """Cycles of one SM for all instructions: its issue slots, or the unit of one class where that takes longer.
+def unit_cycles(gpu: Gpu, counts: Mapping[str, float]) -> float:
+    """Cycles of one SM that the busiest unit takes for ``instruction_counts``; units work side by side."""
+    return max((count / rate for kind, count in counts.items() if (rate := gpu.get(f"rate_{kind}"))), default=0.0)
 
-    Units of different classes work side by side; what they share is the issue slots, of which busy kernels fill the
-    share ``issue_efficiency``.
+
+def issue_cycles(gpu: Gpu, launch: LaunchProfile) -> float:
+    """Cycles of one SM for all instructions: its issue slots, or the busiest unit where that takes longer.
+
+    What units share is the issue slots, of which busy kernels fill the share ``issue_efficiency``.
     """
     counts = instruction_counts(gpu, launch)
-    units = (count / rate for kind, count in counts.items() if (rate := gpu.get(f"rate_{kind}")))
-    return max(sum(counts.values()) * slot_cycles(gpu), *units, 0.0)
+    return max(sum(counts.values()) * slot_cycles(gpu), unit_cycles(gpu, counts))
 
 
 def terms_of(gpu: Gpu, launch: LaunchProfile, rates: Rates) -> dict[str, float]:
@@ -122,20 +125,29 @@ def terms_of(gpu: Gpu, launch: LaunchProfile, rates: Rates) -> dict[str, float]:
     requests = tally.gld_req + tally.gst_req + tally.gatom_req
     return {
         "issue": issue_cycles(gpu, launch) / sm_cycles,
-        "shared": (tally.shm_wavefronts + CAS_WAVEFRONTS * tally.satom_iter + requests) / sm_cycles,
+        "shared": (tally.shm_wavefronts + CAS_PASSES * tally.satom_iter + requests) / sm_cycles,
         "l1": memory.l1_request_bytes / gpu["l1_bytes_per_clk"] / sm_cycles,
         "l2": SECTOR_BYTES * memory.l2_sectors / gpu["l2_bandwidth"],
         "dram": SECTOR_BYTES * memory.dram_sectors / rates.dram_bandwidth,
-        "activations": memory.dram_activations / rates.activations,
-        "atomics": max(memory.atomic_lanes / rates.atomics, launch.memory.hot_address / clock),
         "latency": launch.memory.latency_cycles / clock,
+        **_rate_terms(gpu, launch, rates),
+    }
+
+
+def _rate_terms(gpu: Gpu, launch: LaunchProfile, rates: Rates) -> dict[str, float]:
+    """The terms whose rate may be a guess [s]."""
+    memory = launch.memory.total
+    return {
+        "activations": memory.dram_activations / rates.activations,
+        "atomics": max(memory.atomic_lanes / rates.atomics, launch.memory.hot_address / (gpu["clock_mhz"] * 1e6)),
     }
 
 
 def model_launch(gpu: Gpu, launch: LaunchProfile, rates: Rates) -> ModelledTime:
     """Predicted time of one launch."""
     overhead = gpu["launch_overhead"]
-    slow, terms, fast = (terms_of(gpu, launch, _scaled(rates, end)) for end in (0, None, 1))
+    terms = terms_of(gpu, launch, rates)
+    slow, fast = ({**terms, **_rate_terms(gpu, launch, _scaled(rates, end))} for end in (0, 1))
     first, fastest, slowest = (max(found.values()) for found in (terms, fast, slow))
     apart = max(slow[name] for name in SM_TERMS) + max(slow[name] for name in MEMORY_TERMS)
     uncertain = fastest < first or slowest > first
@@ -156,10 +168,8 @@ def _bound(terms: Mapping[str, float]) -> str:
     return "latency" if terms["latency"] > CLEARLY * terms[longest] else longest
 
 
-def _scaled(rates: Rates, end: int | None) -> Rates:
-    """Rates at the slow (0) or fast (1) end of their ranges, or as they are."""
-    if end is None:
-        return rates
+def _scaled(rates: Rates, end: int) -> Rates:
+    """Rates at the slow (0) or fast (1) end of their ranges."""
     return replace(
         rates,
         atomics=rates.atomics * rates.atomics_range[end],
@@ -201,8 +211,9 @@ def metrics_of(gpu: Gpu, launches: Sequence[LaunchProfile], time: ModelledTime) 
         return {}
     for launch in launches[1:]:
         total = total + launch.memory.total
-    issued = sum(sum(instruction_counts(gpu, launch).values()) for launch in launches)
-    busiest = sum(issue_cycles(gpu, launch) for launch in launches)
+    counts = [instruction_counts(gpu, launch) for launch in launches]
+    issued = sum(sum(of_launch.values()) for of_launch in counts) / gpu["schedulers_per_sm"]
+    busiest = sum(unit_cycles(gpu, of_launch) for of_launch in counts)
     cycles = gpu["sm_count"] * gpu["clock_mhz"] * 1e6 * time.seconds
     peak_bytes = gpu["dram_bandwidth"] * time.seconds
 
@@ -213,8 +224,8 @@ def metrics_of(gpu: Gpu, launches: Sequence[LaunchProfile], time: ModelledTime) 
         "vram_percent": share(SECTOR_BYTES * total.dram_sectors, peak_bytes),
         "read_percent": share(SECTOR_BYTES * total.dram_read, peak_bytes),
         "write_percent": share(SECTOR_BYTES * total.dram_write, peak_bytes),
-        "sm_percent": share(max(busiest * gpu["issue_efficiency"], issued / gpu["schedulers_per_sm"]), cycles),
-        "sm_issue_percent": share(issued / gpu["schedulers_per_sm"], cycles),
+        "sm_percent": share(max(busiest, issued), cycles),
+        "sm_issue_percent": share(issued, cycles),
         "l2_percent": share(SECTOR_BYTES * total.l2_sectors, gpu["l2_bandwidth"] * time.seconds),
         "tex_percent": share(total.l1_request_bytes / gpu["l1_bytes_per_clk"], cycles),
         "l2_hit_percent": share(total.l2_hit, total.l2_sectors),

@@ -22,6 +22,7 @@ from mpmbench.primitive_runs import PrimitiveCase
 from mpmbench.profile import Modeller, occupancy_warps, run_modelled
 from mpmbench.runner import Case, Inputs
 from mpmbench.simt import cache as disk
+from mpmbench.simt.codegen_trace import CAS_PASSES
 from mpmbench.simt.counters import Counters, Tally
 from mpmbench.simt.machine import MemoryCounters, MemoryTally
 
@@ -156,7 +157,7 @@ def latency_shares(launch: LaunchProfile, gpu: Gpu) -> dict[str, float]:
     }
     left = max(0.0, 1 - sum(shares.values()))
     # A shared load is waited for in full where nothing else is left to do, and never longer.
-    shares["shared_latency"] = min(left, (tally.sld_req + 3 * tally.satom_iter) * gpu["shared_latency"] / busy)
+    shares["shared_latency"] = min(left, (tally.sld_req + CAS_PASSES * tally.satom_iter) * gpu["shared_latency"] / busy)
     return {**shares, "alu_latency": left - shares["shared_latency"]}
 
 
