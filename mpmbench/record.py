@@ -13,7 +13,7 @@ import os
 import re
 import statistics
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from types import TracebackType
@@ -30,7 +30,8 @@ from mpmbench.simt.counters import Counters, Finding, SourceLine, Tally
 if TYPE_CHECKING:
     import pandas as pd
 
-SCHEMA = 1  # raised when a reader of the old number would misread the new lines
+SCHEMA = 2  # raised when a reader of the old number could not read the new lines
+READABLE = (1, SCHEMA)  # rows of 1 have no comparison, no tuning and no clocks
 
 # Nodes in a particle's support, in three dimensions: 2, 3 or 4 per axis.
 SUPPORT_NODES = {"linear": 8, "quadratic": 27, "cubic": 64}
@@ -41,16 +42,26 @@ PER_TRANSFER_STEPS = ("grid_clear", "grid_divide")
 
 @dataclass(frozen=True)
 class Measurement:
-    """Times of one step. samples: [s], every one that was kept, in the order taken."""
+    """Times of one step.
+
+    samples: [s], every one that was kept, in the order taken.  mode: state of the caches before each sample: "cold"
+    (overwritten), "hot" (a run of the same before it) or "step" (what the step of a simulation leaves there).
+    stopped_by: why sampling ended, e.g. "verdict", "precision", "time limit".  hertz: clock of the processor during
+    each sample, empty where it is not known.  discarded: samples that were thrown away, by reason.
+    """
 
     samples: tuple[float, ...]
-    mode: str  # "cold" (L2 flushed before each sample) or "warm"
+    mode: str
     warmups: int
-    stopped_by: str  # why sampling ended, e.g. "precision", "timeout", "sample limit"
+    stopped_by: str
+    hertz: tuple[float, ...] = ()
+    discarded: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.samples or not all(math.isfinite(s) and s >= 0 for s in self.samples):
             raise ValueError("a Measurement needs at least one sample, all finite and not negative")
+        if self.hertz and len(self.hertz) != len(self.samples):
+            raise ValueError("a Measurement needs a clock for each sample, or none")
 
     @property
     def median(self) -> float:
@@ -68,6 +79,66 @@ class Measurement:
         """Interquartile range over median."""
         q1, q3 = self.quartiles
         return (q3 - q1) / self.median if self.median else 0.0
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A row beside the others that were timed in the same rounds.
+
+    contest: rows of one contest are paired: sample i of one was taken moments apart from sample i of the other.
+    baseline: its label.  is_baseline: whether this row is it.  speedup: median, low and high of the baseline's time
+    over this row's, pair by pair; None for the baseline and where there is none.  verdict: FAST, SLOW, SAME, AMBG or
+    ????.  leads: no other row of the contest was found to be faster.  noise: the same three numbers of two copies of the
+    baseline.  margin: differences below it are not called differences.  p_value: corrected for the rows of the contest.
+    """
+
+    contest: str
+    baseline: str
+    is_baseline: bool
+    verdict: str
+    speedup: tuple[float, float, float] | None
+    leads: bool
+    noise: tuple[float, float, float]
+    margin: float
+    p_value: float
+    confidence: float
+    rounds: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class Tried:
+    """One configuration of a search. seconds: [s], None where it did not run, and ``reason`` says why."""
+
+    axes: Mapping[str, Any]
+    seconds: float | None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """How a row's axes were found: every configuration that was tried, the chosen one first.
+
+    searched: the axes that were free.  budget: configurations allowed.  possible: how many there are.  kind: of the
+    times, "measured (events)", "measured (wall, CPU)" or "modelled", for which ``gpu``.
+    """
+
+    searched: tuple[str, ...]
+    budget: int
+    possible: int
+    kind: str
+    gpu: str | None
+    tried: tuple[Tried, ...]
+
+
+@dataclass(frozen=True)
+class Repeat:
+    """Two runs on the same input, bit by bit: atomics add in any order. differing of ``of`` numbers differ, by at most
+    ``largest`` relative to the largest of all."""
+
+    differing: int
+    of: int
+    largest: float
 
 
 @dataclass(frozen=True)
@@ -170,6 +241,10 @@ class Record:
     transfer_counters: Counters | None = None
     transfer_measurement: Measurement | None = None
     finish: Mapping[str, StepCost] = field(default_factory=dict)  # steps after the transfer (order restored, ...)
+    rest_of_step: Mapping[str, StepCost] = field(default_factory=dict)  # mode "step": what ran around the transfer
+    comparison: Comparison | None = None  # with the rows timed in the same rounds
+    repeat: Repeat | None = None  # the transfer run twice, where it was measured
+    tuning: Tuning | None = None  # how axes were chosen, where they were searched for
     modelled: Mapping[str, Profile] | None = None  # by the performance model, for each GPU by name
     line_texts: Mapping[SourceLine, str] = field(default_factory=dict)  # of the lines in transfer_counters
     floor_bytes: int | None = None  # compulsory global traffic: each particle and touched node once
@@ -195,6 +270,8 @@ class Record:
             raise ValueError("a modelled time needs counters of a simulated run whose check passed")
         if any(gpu != profile.gpu for gpu, profile in (self.modelled or {}).items()):
             raise ValueError("a profile stands under the name of another GPU")
+        if self.comparison and not self.transfer_measurement:
+            raise ValueError("a comparison needs the times that it compares")
         if self.preprocess.keys() & self.finish.keys():
             raise ValueError("a step before the transfer and one after it share a name")
         if self.skipped_because and (timed or counted or self.check):
@@ -302,7 +379,7 @@ def from_json(line: str) -> Record:
     d = json.loads(line, object_hook=_revive)
     if not isinstance(d, dict) or "schema" not in d:
         raise ValueError("no record: it has no 'schema'")
-    if d["schema"] != SCHEMA:
+    if d["schema"] not in READABLE:
         raise UnknownSchema(d["schema"])
     grid = d["dataset"]["grid"]
     d["dataset"]["grid"] = Grid(tuple(grid["shape"]), grid["dx"], tuple(grid["origin"]))
@@ -320,6 +397,10 @@ def from_json(line: str) -> Record:
         "transfer_counters": _counters(d["transfer_counters"]),
         "transfer_measurement": _measurement(d["transfer_measurement"]),
         "modelled": _modelled(d["modelled"]),
+        "rest_of_step": {name: _step(step) for name, step in d.get("rest_of_step", {}).items()},
+        "comparison": _comparison(d.get("comparison")),
+        "repeat": _maybe(Repeat, d.get("repeat")),
+        "tuning": _tuning(d.get("tuning")),
         "line_texts": {SourceLine(file, number): text for file, number, text in d["line_texts"]},
         "findings": tuple(_finding(f) for f in d["findings"]),
     })  # fmt: skip
@@ -349,7 +430,25 @@ def _counters(d: dict[str, Any] | None) -> Counters | None:
 
 
 def _measurement(d: dict[str, Any] | None) -> Measurement | None:
-    return None if d is None else Measurement(**{**d, "samples": tuple(d["samples"])})
+    return None if d is None else Measurement(**{**d, **{key: tuple(d.get(key, ())) for key in ("samples", "hertz")}})
+
+
+def _comparison(d: dict[str, Any] | None) -> Comparison | None:
+    if d is None:
+        return None
+    speedup = None if d["speedup"] is None else tuple(d["speedup"])
+    return Comparison(**{**d, "speedup": speedup, "noise": tuple(d["noise"])})
+
+
+def _tuning(d: dict[str, Any] | None) -> Tuning | None:
+    if d is None:
+        return None
+    tried = tuple(Tried(_axes(t["axes"]), t["seconds"], t["reason"]) for t in d["tried"])
+    return Tuning(**{**d, "searched": tuple(d["searched"]), "tried": tried})
+
+
+def _maybe(kind: Callable[..., Any], d: dict[str, Any] | None) -> Any:
+    return None if d is None else kind(**d)
 
 
 def _step(d: dict[str, Any]) -> StepCost:
@@ -484,7 +583,7 @@ def read_records(path: str | Path) -> list[Record]:
             records.append(from_json(row.decode()))
         except UnknownSchema as error:
             raise InputError(
-                f"{path}:{number}: record schema {error} is not known, this mpmbench reads schema {SCHEMA}:"
+                f"{path}:{number}: record schema {error} is not known, this mpmbench reads schema {' and '.join(map(str, READABLE))}:"
                 " use the version that wrote the file"
             ) from None
         except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -536,6 +635,14 @@ def flatten(record: Record) -> dict[str, Any]:
     if record.check:
         row |= {f"check_{key}": getattr(record.check, key) for key in ("passed", "worst_error", "allowed", "ratio")}
     row |= _flat_cost("transfer", StepCost(record.transfer_counters, record.transfer_measurement))
+    if record.comparison:
+        row |= {f"comparison_{name}": value for name, value in asdict(record.comparison).items()
+                if name not in ("speedup", "noise")}  # fmt: skip
+        for name in ("speedup", "noise"):
+            three = getattr(record.comparison, name) or (None, None, None)
+            row |= dict(zip((f"comparison_{name}{end}" for end in ("", "_low", "_high")), three, strict=True))
+    if record.repeat:
+        row |= {f"repeat_{name}": value for name, value in asdict(record.repeat).items()}
     row |= _flat_cost("preprocess", total_cost(record.preprocess.values()))
     for name, step in record.steps.items():
         row |= _flat_cost(f"step_{name}", step)
@@ -568,6 +675,9 @@ def _flat_cost(prefix: str, cost: StepCost) -> dict[str, Any]:
         q1, q3 = cost.measurement.quartiles
         row |= {f"{prefix}_median_s": cost.measurement.median, f"{prefix}_q1_s": q1, f"{prefix}_q3_s": q3}
         row[f"{prefix}_samples"] = len(cost.measurement.samples)
+        row[f"{prefix}_cache"] = cost.measurement.mode
+        if cost.measurement.hertz:
+            row[f"{prefix}_median_hz"] = statistics.median(cost.measurement.hertz)
     return row
 
 

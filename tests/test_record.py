@@ -174,7 +174,7 @@ def test_an_existing_file_is_safe(tmp_path, simulated):
     ("text", "message"),
     [
         (None, "cannot read records"),
-        ('{"schema": 99}\n', "schema 99 is not known, this mpmbench reads schema 1"),
+        ('{"schema": 99}\n', "schema 99 is not known, this mpmbench reads schema 1 and 2"),
         ('{"a": 1}\n', ":1: not a record"),
         ("[]\n", ":1: not a record"),
         ("garbage\n", ":1: not a record"),
