@@ -88,8 +88,8 @@ class Comparison:
     contest: rows of one contest are paired: sample i of one was taken moments apart from sample i of the other.
     baseline: its label.  is_baseline: whether this row is it.  speedup: median, low and high of the baseline's time
     over this row's, pair by pair; None for the baseline and where there is none.  verdict: FAST, SLOW, SAME, AMBG or
-    ????.  leads: no other row of the contest was found to be faster.  noise: the same three numbers of two copies of the
-    baseline.  margin: differences below it are not called differences.  p_value: corrected for the rows of the contest.
+    ????.  leads: no other row of the contest was found to be faster.  noise: the same three numbers of two copies of
+    the baseline.  margin: smaller differences are not called differences.  p_value: corrected for the contest's rows.
     """
 
     contest: str
@@ -582,8 +582,9 @@ def read_records(path: str | Path) -> list[Record]:
         try:
             records.append(from_json(row.decode()))
         except UnknownSchema as error:
+            known = " and ".join(map(str, READABLE))
             raise InputError(
-                f"{path}:{number}: record schema {error} is not known, this mpmbench reads schema {' and '.join(map(str, READABLE))}:"
+                f"{path}:{number}: record schema {error} is not known, this mpmbench reads schema {known}:"
                 " use the version that wrote the file"
             ) from None
         except (ValueError, KeyError, TypeError, AttributeError) as error:
