@@ -86,7 +86,7 @@ def _selection(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--dx", type=float, help="Node spacing [m]."),
         click.option("--origin", type=(float, float, float), metavar="X Y Z", help="Position of node (0, 0, 0) [m]."),
         click.option("-d", "--device", "devices", multiple=True, metavar="DEVICE",
-                     help="simulated, cuda, cuda:N. Default: simulated, and cuda where there is a GPU."),
+                     help="simulated, cpu, cuda, cuda:N. Default: simulated, and cuda where there is a GPU."),
         click.option("--arch", default=None, metavar="sm_XX", help="Architecture the simulated device compiles for."),
         click.option("--variants", "variant_dirs", multiple=True, type=click.Path(path_type=Path), metavar="DIR",
                      help="A folder with your own kernel (.cu) and module (.py); may be given again."),
@@ -193,13 +193,40 @@ def _parse_axis(text: str) -> tuple[str, list[Any]]:
     return name.strip(), [parse_value(word) for word in words]
 
 
+def _cache_states(axes: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The values of the axis ``cache``, which belongs to the timing, and the other axes."""
+    found = [(name, values) for name, values in map(_parse_axis, axes) if name == "cache"]
+    others = [text for text in axes if _parse_axis(text)[0] != "cache"]
+    if len(found) > 1:
+        raise InputError("axis 'cache' is given twice: write cache=[value,value]")
+    return [str(value) for value in found[0][1]] if found else ["cold"], others
+
+
+def _timings(caches: Sequence[str], quick: bool, rigorous: bool, baseline: str) -> list[Any]:
+    """How measured rows are made, one for each state of the caches."""
+    from mpmbench import measure
+    from mpmbench.contest import Timing
+    from mpmbench.protocol import rounds
+
+    rules = rounds.QUICK if quick else rounds.RIGOROUS if rigorous else rounds.Rules()
+    sampling = measure.QUICK if quick else measure.Sampling()
+    return [Timing(cache, rules, sampling, baseline) for cache in dict.fromkeys(caches)]
+
+
+def _refuse_unknown_baseline(cases: Sequence[Any], baseline: str) -> None:
+    if baseline and not any(case.label.startswith(baseline) for case in cases):
+        labels = ", ".join(dict.fromkeys(case.label for case in cases))
+        raise InputError(f"no row is called {baseline!r}, the baseline asked for: valid are {labels}")
+
+
 def _open_devices(names: Sequence[str], arch: str | None, mode: str) -> list[Any]:
     from mpmbench.device import open_device
 
     if not names:
         names = ["simulated", *(["cuda"] if _gpu_present() else [])]
     options = {"mode": mode} | ({"arch": arch} if arch else {})
-    return [open_device(name, **(options if name == "simulated" else {})) for name in names]
+    takes = {"simulated": options, "cpu": {"arch": arch} if arch else {}}
+    return [open_device(name, **takes.get(name, {})) for name in names]
 
 
 def _gpu_present() -> bool:
@@ -287,6 +314,14 @@ def _axis_values(variant: Any) -> dict[str, list[Any]]:
     metavar="NAME[,NAME]",
     help="Model the time on these GPUs, by name or description file (.toml); none need be there.",
 )
+@click.option("--rigorous", is_flag=True, help="More and longer rounds: finer differences are told apart.")
+@click.option(
+    "--baseline",
+    default="",
+    metavar="NAME",
+    help="Strategy that the others are compared with, as the tables name it. Default: unsorted global atomics.",
+)
+@click.option("--shard", metavar="I/N", help="Run part I of N; what is timed together stays together.")
 @click.option("--resume", is_flag=True, help="Keep the rows of --json FILE, run only what is missing.")
 @click.option("--dry-run", is_flag=True, help="Say what would run, and stop.")
 def run(
@@ -296,6 +331,9 @@ def run(
     md_path: Path | None,
     csv_path: Path | None,
     gpu_names: Sequence[str],
+    rigorous: bool,
+    baseline: str,
+    shard: str | None,
     resume: bool,
     dry_run: bool,
     devices: Sequence[str],
@@ -303,15 +341,18 @@ def run(
     quick: bool,
     **selection: Any,
 ) -> None:
-    """Run variants: check each result, then count it (simulated) or time it (cuda).
+    """Run variants: check each result, then count it (simulated) or time it (cuda; cpu by wall clock).
 
     \b
     mpmbench run --quick
     mpmbench run -b "p2g_*" --dataset random -a "batching=[1,4]" --json rows.jsonl --html report.html
-    mpmbench run --dataset my_particles.npz
+    mpmbench run --dataset my_particles.npz -d cuda -a "cache=[cold,step]"
     mpmbench run --gpu h100,a100,rtx4090 --dataset my_particles.npz --html which_one.html
     """
+    caches, selection["axes"] = _cache_states(selection["axes"])
     cases = _choose(**selection, quick=quick, preset_name=preset_name)
+    if quick and rigorous:
+        raise InputError("--quick and --rigorous exclude each other: leave one of them out")
     if resume and json_path is None:
         raise InputError("--resume needs --json FILE, the file whose rows it keeps")
     _refuse_targets([json_path, html_path, md_path, csv_path], selection["datasets"])
@@ -320,13 +361,20 @@ def run(
         return
     # The thesis measured a GTX 970: its rows are counted on the code that NVRTC makes for that GPU.
     opened = _open_devices(devices, arch or ("sm_52" if preset_name == "thesis" else None), "count")
+    if shard is not None:
+        from mpmbench.session import keeps_time
+        from mpmbench.session import shard as part
+
+        cases = part(cases, shard, together=any(map(keeps_time, opened)))
     if dry_run:
         for device in opened:
             for case in cases:
                 console.print(f"{device.name} {device.arch}  {case.title}", markup=False, soft_wrap=True)
         console.print(f"{len(cases) * len(opened)} rows")
         return
-    records = _run_cases(cases, opened, json_path, "append" if resume else "replace", quick)
+    timings = _timings(caches, quick, rigorous, baseline)
+    _refuse_unknown_baseline(cases, baseline)
+    records = _run_cases(cases, opened, json_path, "append" if resume else "replace", timings)
     _write_reports(records, html_path, md_path, csv_path)
     _summarise(records, [p for p in (json_path, html_path, md_path, csv_path) if p])
 
@@ -344,7 +392,7 @@ def check(
     cases = _choose(**selection, quick=quick)
     _refuse_targets([json_path], selection["datasets"])
     opened = _open_devices(devices, arch, "debug" if debug else "run")
-    records = _run_cases(cases, opened, json_path, "replace", quick)
+    records = _run_cases(cases, opened, json_path, "replace")
     for record in records:
         error = f"error/allowed {record.check.ratio:.3f}" if record.check else ""
         if record.check and record.check.worst_node:
@@ -505,46 +553,36 @@ def _run_modelled(
 # --- running ----------------------------------------------------------------------------------------------------------
 
 
-def _run_cases(cases: list[Any], devices: list[Any], json_path: Path | None, existing: Any, quick: bool) -> list[Any]:
-    from mpmbench import measure
-    from mpmbench.environment import Environment
-    from mpmbench.primitive_runs import PrimitiveCase
+def _run_cases(
+    cases: list[Any], devices: list[Any], json_path: Path | None, existing: Any, timings: Sequence[Any] = ()
+) -> list[Any]:
+    """Records of all cases, each on disk before the next begins. No timings: check only."""
     from mpmbench.record import RecordWriter, read_records
-    from mpmbench.runner import Inputs, refuse_bad_input, resume_key, run_case
+    from mpmbench.runner import refuse_bad_input
+    from mpmbench.session import keeps_time, run_session
 
     # SIGTERM ends a run as Ctrl-C does: the row in flight is lost, the others are on disk.
     signal.signal(signal.SIGTERM, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
-    kept: dict[Any, Any] = {}
-    if json_path is not None and existing == "append" and json_path.exists():
-        kept = {resume_key(record): record for record in read_records(json_path)}
-    refuse_bad_input(case for case in cases if not isinstance(case, PrimitiveCase))
-    environment = Environment.capture()
-    sampling = measure.QUICK if quick else None
+    known = read_records(json_path) if json_path is not None and existing == "append" and json_path.exists() else []
+    refuse_bad_input(cases)
+    total = sum(len(cases) * (max(1, len(timings)) if keeps_time(device) else 1) for device in devices)
     records: list[Any] = []
-    inputs = Inputs()
-    total = len(cases) * len(devices)
     writer = RecordWriter(json_path, existing) if json_path else None
     try:
         with _progress() as progress:
             task = progress.add_task("", total=total)
-            for device in devices:
-                for case in cases:
-                    progress.update(task, description=f"{device.name} {case.title}")
-                    block = isinstance(case, PrimitiveCase)
-                    key = (case.resume_key(device) if block else resume_key(case, device, inputs)) if kept else None
-                    record = kept.get(key)
-                    if record is None:
-                        if block:
-                            record = case.run(device, environment, sampling)
-                        else:
-                            record = run_case(case, device, inputs, environment, sampling)
-                        if writer:
-                            writer.write(record)
-                    records.append(record)
-                    progress.advance(task)
-                    if not progress.console.is_terminal:
-                        notes.print(f"[{len(records)}/{total}] {device.name} {case.title}: {record.status}",
-                                    markup=False, soft_wrap=True)  # fmt: skip
+
+            def tick(what: str) -> None:
+                progress.update(task, description=what)
+
+            for record, new in run_session(cases, devices, timings, known, tick):
+                if new and writer:
+                    writer.write(record)
+                records.append(record)
+                progress.advance(task)
+                if not progress.console.is_terminal:
+                    notes.print(f"[{len(records)}/{total}] {record.device} {record.variant} on {record.dataset.name}: "
+                                f"{record.status}", markup=False, soft_wrap=True)  # fmt: skip
     finally:
         if writer:
             writer.close()

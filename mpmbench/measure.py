@@ -1,4 +1,4 @@
-"""Times of a checked plan on a GPU: warm-up, cold or warm samples, and when to stop.
+"""Times of single steps that nothing competes with (sorting, clearing): warm-up, samples, and when to stop.
 
 One sample is: reset the outputs, flush the second-level cache, wait, hold the stream, event, the step's kernels, event,
 wait. Outputs are reset and the cache is flushed outside the timed span. The protocol follows NVBench (cold
@@ -10,16 +10,15 @@ The module needs of a device only what ``TimedDevice`` lists, so a test can driv
 
 from __future__ import annotations
 
-import math
 import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Any, Literal, Protocol
 
 from mpmbench.device import Launch
-from mpmbench.errors import InputError, WrongResultError
+from mpmbench.errors import InputError
+from mpmbench.protocol.verdict import median_interval
 from mpmbench.record import Measurement
 
 # Below this, the resolution of events (about 0.5 us, CUDA Runtime API, cudaEventElapsedTime) exceeds 2 %.
@@ -61,40 +60,18 @@ class TimedStep(Protocol):
     def after(self) -> Callable[[], Any] | None: ...
 
 
-class Checked(Protocol):
-    """The verdict of the comparison with the reference."""
-
-    @property
-    def passed(self) -> bool: ...
-
-
-class TimedPlan(Protocol):
-    """A strategy ready to run: preprocessing steps, the transfer, the steps after it, and how to reset outputs."""
-
-    @property
-    def steps(self) -> Sequence[TimedStep]: ...
-
-    @property
-    def transfer(self) -> TimedStep: ...
-
-    @property
-    def finish(self) -> Sequence[TimedStep]: ...
-
-    def reset(self) -> Sequence[TimedStep]: ...
-
-
 @dataclass(frozen=True)
 class Sampling:
     """How to sample.
 
-    mode: "cold" flushes the second-level cache before each sample, "warm" leaves what the run before left there.
+    mode: "cold" flushes the caches before each sample, "step" and "hot" leave what the steps before left there.
     precision: stop once the 99 % confidence interval of the median is this narrow (half width over median).
     time_limit [s]: wall clock per group of steps, warm-up apart.
     warmup_seconds: least GPU time of the warm-up; it goes on, up to warmup_limit [s] of wall clock, until the medians
     of two successive chunks of samples agree within warmup_drift.
     """
 
-    mode: Literal["cold", "warm"] = "cold"
+    mode: Literal["cold", "hot", "step"] = "cold"
     min_samples: int = 10
     max_samples: int = 300
     precision: float = 0.005
@@ -105,8 +82,8 @@ class Sampling:
     warmup_chunk: int = 5
 
     def __post_init__(self) -> None:
-        if self.mode not in ("cold", "warm"):
-            raise InputError(f"unknown sampling mode {self.mode!r}: valid are 'cold' and 'warm'")
+        if self.mode not in ("cold", "hot", "step"):
+            raise InputError(f"unknown sampling mode {self.mode!r}: valid are 'cold', 'hot' and 'step'")
         if not 1 <= self.min_samples <= self.max_samples:
             raise InputError(
                 f"sampling needs 1 <= min_samples <= max_samples, not {self.min_samples}, {self.max_samples}"
@@ -114,29 +91,6 @@ class Sampling:
 
 
 QUICK = Sampling(max_samples=30, time_limit=2.0, warmup_limit=0.2)
-
-
-@dataclass(frozen=True)
-class PlanTimes:
-    """Measurements of a plan, step by step: each preprocessing step is measured on its own."""
-
-    preprocess: dict[str, Measurement]
-    transfer: Measurement
-    finish: dict[str, Measurement]
-
-
-def measure_plan(device: TimedDevice, plan: TimedPlan, check: Checked, sampling: Sampling | None = None) -> PlanTimes:
-    """Time a plan whose result has been checked on this device.
-
-    Raises WrongResultError where the check failed: a wrong kernel has no time.
-    """
-    if not check.passed:
-        raise WrongResultError(f"not timed on {device.name}: its result does not agree with the reference")
-    sampling = sampling or Sampling()
-    preprocess = measure_steps(device, plan.steps, sampling=sampling)
-    transfer, *finish = [plan.transfer, *plan.finish]
-    measured = measure_steps(device, [transfer, *finish], before=plan.reset(), sampling=sampling)
-    return PlanTimes(preprocess, measured.pop(transfer.name), measured)
 
 
 def measure_steps(
@@ -185,18 +139,6 @@ def sample_step(device: TimedDevice, step: TimedStep, mode: str) -> float:
     return seconds
 
 
-def median_interval(samples: Sequence[float], confidence: float = 0.99) -> tuple[float, float]:
-    """Confidence interval of the median from order statistics; it assumes nothing of the distribution.
-
-    Unbounded where there are too few samples for the confidence (fewer than 8 for 99 %).
-    """
-    rank = _lowest_rank(len(samples), confidence)
-    if rank == 0:
-        return -math.inf, math.inf
-    ordered = sorted(samples)
-    return ordered[rank - 1], ordered[-rank]
-
-
 def too_fast_to_rank(measurement: Measurement) -> bool:
     """True where the resolution of events blurs the time: print it, but rank nothing by it."""
     return measurement.median < SHORTEST_RANKED
@@ -206,7 +148,7 @@ class DeviceClock:
     """A clock that moves only by event times, for harnesses that bring their own loop and take a timer
     (pytest-benchmark: ``timer=clock``, and ``pedantic`` with one iteration per round)."""
 
-    def __init__(self, device: TimedDevice, mode: Literal["cold", "warm"] = "cold") -> None:
+    def __init__(self, device: TimedDevice, mode: Literal["cold", "hot", "step"] = "cold") -> None:
         self.device = device
         self.mode = mode
         self.seconds = 0.0
@@ -256,18 +198,4 @@ def _stop_reason(rounds: list[list[float]], seconds: float, sampling: Sampling) 
 
 
 def _precise(samples: Sequence[float], precision: float) -> bool:
-    low, high = median_interval(samples)
-    return (high - low) / 2 <= precision * statistics.median(samples)
-
-
-@cache
-def _lowest_rank(n: int, confidence: float) -> int:
-    """Largest r such that [x_(r), x_(n-r+1)] covers the median with the confidence; 0 if none does."""
-    allowed = round((1 - confidence) / 2 * 10**9) * 2**n // 10**9  # sequences of n coin flips allowed in one tail
-    tail, rank = 0, 0
-    while rank < n / 2:
-        tail += math.comb(n, rank)
-        if tail > allowed:
-            break
-        rank += 1
-    return rank
+    return median_interval(samples).half_width <= precision

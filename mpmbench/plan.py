@@ -18,8 +18,24 @@ from mpmbench.device import Device, LaunchReport, run_all
 from mpmbench.errors import InputError
 from mpmbench.reference import Nodes, ParticleValues
 from mpmbench.spline import get_spline
-from mpmbench.variants import ATTRIBUTES, RESULTS, Variant, why_impossible
+from mpmbench.variants import ATTRIBUTES, RESULTS, Variant, get, resolve_axes, why_impossible
 from mpmbench.workspace import Step, Workspace, buffer_table
+
+# The other half of a simulation's step where a strategy is timed as a part of one: the plainest there is.
+PARTNERS = {"p2g": "g2p_global_gather", "g2p": "p2g_global_atomic"}
+
+
+@dataclass(frozen=True)
+class RestOfStep:
+    """What else a simulation's step runs, on the same particles and nodes.
+
+    before: untimed, so that the transfer finds the caches as the step leaves them.  step: all steps of one simulation
+    step in order, by name; ``transfer`` is the name of the strategy's own.
+    """
+
+    before: tuple[Step, ...]
+    step: tuple[Step, ...]
+    transfer: str
 
 
 @dataclass(frozen=True)
@@ -46,9 +62,9 @@ class Plan:
 
     def run_once(self, device: Device) -> tuple[dict[str, LaunchReport], LaunchReport, dict[str, LaunchReport]]:
         """Run everything once: reports of the preprocessing steps, of the transfer, and of the steps after it."""
-        before = _run(device, self.steps)
-        transfer = _run(device, [self.transfer])["transfer"]
-        return before, transfer, _run(device, self.finish)
+        before = run_steps(device, self.steps)
+        transfer = run_steps(device, [self.transfer])["transfer"]
+        return before, transfer, run_steps(device, self.finish)
 
     def outputs(self) -> Nodes | ParticleValues:
         """The result on the host, in the plan's dtype and the dataset's order."""
@@ -84,6 +100,25 @@ def build_plan(
     return Plan(work, preprocess.steps(work), preprocess.finish(work), predict_bytes(variant, dataset, axes))
 
 
+def rest_of_step(plan: Plan, device: Device) -> RestOfStep:
+    """The step around a plan that has run: clear, P2G, divide, G2P, of which the plan is one."""
+    work = plan.work
+    partner = get(PARTNERS[work.variant.transfer])
+    axes = resolve_axes(partner, {name: value for name, value in work.axes.items() if name in partner.axes})
+    table = buffer_table(partner, work.grid, work.particle_count, axes)
+    own = buffer_table(work.variant, work.grid, work.particle_count, work.axes)
+    # The caches must see one set of particles and nodes, as in a simulation, not a copy of its own for each half.
+    shared = {name: work.buffers[name] for name, layout in table.items() if own.get(name) == layout}
+    other = Workspace(partner, axes, work.grid, work.particle_count, device, shared)
+    mine, others = plan.transfer, Step(partner.name, partner.launch(other))
+    mine = Step(work.variant.name, mine.launches)
+    if work.variant.transfer == "p2g":
+        clear, divide = preprocess.grid_clear(work), preprocess.grid_divide(other)
+        return RestOfStep((divide, others, clear), (clear, mine, divide, others), mine.name)
+    clear, divide = preprocess.grid_clear(other), preprocess.grid_divide(work)
+    return RestOfStep((clear, others, divide), (clear, others, divide, mine), mine.name)
+
+
 def predict_bytes(variant: Variant, dataset: Dataset, axes: Mapping[str, Any]) -> int:
     """Device memory that a plan takes [bytes], known before anything is allocated."""
     table = buffer_table(variant, dataset.grid, dataset.particle_count, axes)
@@ -113,7 +148,8 @@ def touched_nodes(dataset: Dataset, spline_name: str, dtype: Any) -> int:
     return int(occupied.sum())
 
 
-def _run(device: Device, steps: Sequence[Step]) -> dict[str, LaunchReport]:
+def run_steps(device: Device, steps: Sequence[Step]) -> dict[str, LaunchReport]:
+    """Run steps once, in order; what their launches tell, by name."""
     reports = {}
     for step in steps:
         reports[step.name] = run_all(device, step.launches)

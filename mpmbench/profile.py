@@ -16,10 +16,9 @@ from mpmbench.gpu.machine import machine_for
 from mpmbench.gpu.model import Rates, metrics_of, model_launches, rates_of
 from mpmbench.gpu.modelled import ModelledTime
 from mpmbench.gpu.occupancy import occupancy
-from mpmbench.primitive_runs import PrimitiveCase
 from mpmbench.profile_record import LineProfile, Profile, Residency
 from mpmbench.record import Record
-from mpmbench.runner import Inputs, refuse_bad_input, resume_key, run_case
+from mpmbench.runner import Inputs, refuse_bad_input, resume_key
 from mpmbench.simt.codegen_trace import CAS_PASSES
 from mpmbench.simt.counters import SourceLine, Tally
 from mpmbench.simt.machine import MemoryTally
@@ -143,7 +142,7 @@ def profile_cases(
     progress: told what runs, the cases done and the cases in all. keep: given each new record as soon as it is whole.
     known: records of an earlier run, taken as they are where they model the same case on all GPUs asked for.
     """
-    refuse_bad_input(case for case in cases if not isinstance(case, PrimitiveCase))
+    refuse_bad_input(cases)
     environment = Environment.capture()
     inputs = Inputs()
     earlier = {resume_key(record): record for record in known if record.modelled}
@@ -151,7 +150,7 @@ def profile_cases(
     groups = list(itertools.product(cases, _by_architecture(gpus)))
     for done, (case, group) in enumerate(groups):
         progress(f"{', '.join(gpu.name for gpu in group)}: {case.title}", done, len(groups))
-        found = earlier.get(_resume_key(case, group[0], inputs)) if earlier else None
+        found = earlier.get(case.resume_key(Modeller(group[0]).device(), inputs)) if earlier else None
         if found is None or not {gpu.name for gpu in group} <= set(found.modelled or ()):
             found = _profile_group(case, group, inputs, environment)
             keep(found)
@@ -181,13 +180,6 @@ def _profile_group(case: Any, group: Sequence[Gpu], inputs: Inputs, environment:
     return record
 
 
-def _resume_key(case: Any, gpu: Gpu, inputs: Inputs) -> tuple[Any, ...]:
-    device = Modeller(gpu).device()
-    return case.resume_key(device) if isinstance(case, PrimitiveCase) else resume_key(case, device, inputs)
-
-
 def run_modelled(case: Any, model: Modeller, inputs: Inputs, environment: Environment) -> Record:
     """Run, check, count and model one case."""
-    if isinstance(case, PrimitiveCase):
-        return case.run(model.device(), environment, model=model)
-    return run_case(case, model.device(), inputs, environment, model=model)
+    return case.run(model.device(), inputs, environment, model)

@@ -228,10 +228,11 @@ class Record:
     transfer: str  # "p2g" | "g2p", or the operation of a primitive: "reduce", "scan", ...
     dataset: DatasetSummary
     axes: Mapping[str, Any]
-    device: str  # "simulated", "cuda:0"
+    device: str  # "simulated", "cuda:0", "cpu"
     arch: str  # "sm_52", what the kernels were compiled for
     environment: Environment
     schema: int = SCHEMA
+    cache: str | None = None  # state of the caches before each sample, where the device keeps time: Measurement.mode
     variant_summary: str = ""
     default_axes: Mapping[str, Any] = field(default_factory=dict)  # of this variant
     kernel_info: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # kernel -> registers, shared_bytes..
@@ -624,6 +625,7 @@ def flatten(record: Record) -> dict[str, Any]:
         "transfer": record.transfer,
         "status": record.status,
         "device": record.device,
+        "cache": record.cache,
         "arch": record.arch,
         "dataset": record.dataset.name,
         "particles": record.dataset.n,

@@ -16,11 +16,11 @@ import numpy as np
 
 from mpmbench import plan as planning
 from mpmbench.check import CheckResult, check_g2p, check_p2g
+from mpmbench.contest import BASELINES, PROBLEM_AXES, Contender
 from mpmbench.dataset import Dataset, load_dataset
 from mpmbench.device import Device, Launch, LaunchReport
 from mpmbench.environment import Environment, machine_bytes
 from mpmbench.errors import InputError
-from mpmbench.measure import Sampling, measure_plan
 from mpmbench.profile_record import Profile
 from mpmbench.record import Check, DatasetSummary, Record, StepCost, line_texts
 from mpmbench.reference import Nodes, ReferenceNodes, ReferenceParticles, g2p, grid_divide, p2g
@@ -75,11 +75,51 @@ class Case:
         return replace(self, dataset=replace(self.dataset, particles=particles), preset_row=None)
 
     @property
+    def label(self) -> str:
+        """The variant and what differs from its defaults: unique among the cases of a contest."""
+        return label_of(self.name, self.axes, resolve_axes(self.variant, {}))
+
+    @property
     def title(self) -> str:
-        """For progress lines: the variant and what differs from its defaults."""
-        defaults = resolve_axes(self.variant, {})
-        differing = [f"{k}={format_axis(v)}" for k, v in self.axes.items() if defaults.get(k) != v]
-        return " ".join([self.variant.name, self.dataset.name, *differing])
+        """For progress lines."""
+        return f"{self.label} on {self.dataset.name}"
+
+    def contest_key(self, inputs: Inputs) -> tuple[Any, ...]:
+        """Cases of equal key answer the same question."""
+        return (self.variant.transfer, self.dataset, *(self.axes[axis] for axis in PROBLEM_AXES))
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether this is what a user has before reading any of this: global atomics (or a gather), never sorted."""
+        return self.name == BASELINES[self.variant.transfer] and self.axes["particle_order"] == "given"
+
+    def device_bytes(self, inputs: Inputs) -> int:
+        """Device memory that it takes while it is timed."""
+        if why_impossible(self.variant, self.axes):
+            return 0
+        return planning.predict_bytes(self.variant, inputs.select(self.dataset), self.axes)
+
+    def run(self, device: Device, inputs: Inputs, environment: Environment, model: Model | None = None) -> Record:
+        """``run_case`` for this case."""
+        return run_case(self, device, inputs, environment, model)
+
+    def prepare(
+        self, device: Device, inputs: Inputs, environment: Environment, cache: str = "cold"
+    ) -> Record | Contender:
+        """``prepare_case`` for this case."""
+        return prepare_case(self, device, inputs, environment, cache)
+
+    def resume_key(self, device: Device, inputs: Inputs) -> tuple[Any, ...]:
+        """Equal to ``resume_key`` of the Record that this case would repeat."""
+        fingerprint, row = inputs.select(self.dataset).fingerprint, self.preset_row or {}
+        where = (device.name, device.arch)
+        return (self.name, _axis_key(self.axes), fingerprint, where, row.get("table"), row.get("row"))
+
+
+def label_of(name: str, axes: Mapping[str, Any], defaults: Mapping[str, Any]) -> str:
+    """A strategy and its axes that are not at their defaults, the problem's own left out."""
+    differing = [f"{k}={format_axis(v)}" for k, v in axes.items() if defaults.get(k) != v and k not in PROBLEM_AXES]
+    return " ".join([name, *differing])
 
 
 def format_axis(value: Any) -> str:
@@ -107,12 +147,13 @@ def cases_of(
     return cases
 
 
-def refuse_bad_input(cases: Iterable[Case]) -> None:
+def refuse_bad_input(cases: Iterable[Any]) -> None:
     """Load every dataset and hold its particles to the splines and number types of its cases; the first problem is an
     InputError. To be called before any file is touched and before an hour of work."""
     uses: dict[DatasetChoice, dict[tuple[str, str], None]] = {}
     for case in cases:
-        uses.setdefault(case.dataset, {})[case.axes["spline"], case.axes["dtype"]] = None
+        if isinstance(case, Case):
+            uses.setdefault(case.dataset, {})[case.axes["spline"], case.axes["dtype"]] = None
     for choice, kinds in uses.items():
         dataset = choice.load()
         for spline, dtype in kinds:
@@ -161,17 +202,68 @@ Model = Callable[[Mapping[str, LaunchReport], LaunchReport, Mapping[str, LaunchR
 
 
 def run_case(
-    case: Case,
-    device: Device,
-    inputs: Inputs,
-    environment: Environment,
-    sampling: Sampling | None = None,
-    model: Model | None = None,
+    case: Case, device: Device, inputs: Inputs, environment: Environment, model: Model | None = None
 ) -> Record:
-    """Run, check, and count or measure one case. Errors of the case become its record's reason, not an exception.
+    """Run, check and count one case. Errors of the case become its record's reason, not an exception.
 
     model: asked for modelled times once the result is known to be right; for a device in mode profile.
     """
+    about = _about(case, device, inputs, environment)
+    if reason := _why_not_here(case, device, inputs, about):
+        return Record(**about, skipped_because=reason)
+    begin = time.perf_counter()
+    try:
+        plan, reports, check = _checked(case, device, inputs, about)
+    except InputError as error:
+        return Record(**about, failed_because=str(error), host_seconds=time.perf_counter() - begin)
+    preprocess, transfer, finish = reports
+    # A wrong row keeps no figures: its counts are those of another computation.
+    counters = transfer.counters if check.passed else None
+    about |= kernel_facts(device, plan.transfer.launches, counters)
+    if counters is not None:
+        about["preprocess"] = {name: StepCost(counters=report.counters) for name, report in preprocess.items()}
+        about["finish"] = {name: StepCost(counters=report.counters) for name, report in finish.items()}
+        if model is not None:
+            about["modelled"] = model(preprocess, transfer, finish)
+    return Record(**about, host_seconds=time.perf_counter() - begin)
+
+
+def prepare_case(
+    case: Case, device: Device, inputs: Inputs, environment: Environment, cache: str = "cold"
+) -> Record | Contender:
+    """Build, run and check one case so that it can be timed; a Record where it has come to an end before.
+
+    cache: state of the caches before each sample, see ``Measurement.mode``; "step" brings the rest of the step along.
+    """
+    about = _about(case, device, inputs, environment)
+    if reason := _why_not_here(case, device, inputs, about):
+        return Record(**about, skipped_because=reason)
+    begin = time.perf_counter()
+    try:
+        plan, _, check = _checked(case, device, inputs, about)
+        about |= kernel_facts(device, plan.transfer.launches, None)
+        if not check.passed:
+            return Record(**about, host_seconds=time.perf_counter() - begin)
+        rest = planning.rest_of_step(plan, device) if cache == "step" else None
+        if rest:
+            planning.run_steps(device, rest.before)  # compiles and loads
+    except InputError as error:
+        return Record(**about, failed_because=str(error), host_seconds=time.perf_counter() - begin)
+    return Contender(
+        label=case.label,
+        about=about,
+        steps=plan.steps,
+        transfer=plan.transfer,
+        finish=plan.finish,
+        reset=plan.reset(),
+        outputs=plan.outputs,
+        rest=rest,
+        begin=begin,
+    )
+
+
+def _about(case: Case, device: Device, inputs: Inputs, environment: Environment) -> dict[str, Any]:
+    """What a record says before anything has run."""
     variant, axes = case.variant, case.axes
     dataset = inputs.select(case.dataset)
     about: dict[str, Any] = {
@@ -187,63 +279,37 @@ def run_case(
         "preset_row": case.preset_row,
         "floor_bytes": planning.floor_bytes(variant, dataset, axes),
     }
-    if reason := why_impossible(variant, axes):
-        return Record(**about, skipped_because=reason)
-    about["device_bytes_predicted"] = planning.predict_bytes(variant, dataset, axes)
-    free = free_bytes(device)
-    if about["device_bytes_predicted"] > free:
-        need = about["device_bytes_predicted"]
-        return Record(
-            **about, skipped_because=f"needs {need / 2**30:.2f} GiB, {device.name} has {free / 2**30:.2f} free"
-        )
-    here, check_needs = machine_bytes(), CHECK_BYTES_PER_NODE * dataset.grid.node_count
-    if device.name == "simulated":
-        check_needs += about["device_bytes_predicted"]
+    if why_impossible(variant, axes) is None:
+        about["device_bytes_predicted"] = planning.predict_bytes(variant, dataset, axes)
+    return about
+
+
+def _why_not_here(case: Case, device: Device, inputs: Inputs, about: dict[str, Any]) -> str | None:
+    """Why a case cannot exist, or does not fit."""
+    if reason := why_impossible(case.variant, case.axes):
+        return reason
+    need, free = about["device_bytes_predicted"], free_bytes(device)
+    if need > free:
+        return f"needs {need / 2**30:.2f} GiB, {device.name} has {free / 2**30:.2f} free"
+    here, check_needs = machine_bytes(), CHECK_BYTES_PER_NODE * inputs.select(case.dataset).grid.node_count
+    if not hasattr(device, "free_bytes"):
+        check_needs += need
     if check_needs > here:
-        return Record(
-            **about,
-            skipped_because=f"run and check need {check_needs / 2**30:.2f} GiB of memory, {here / 2**30:.2f} are free",
-        )
-    begin = time.perf_counter()
-    try:
-        return _run(case, device, inputs, about, sampling, begin, model)
-    except InputError as error:
-        return Record(**about, failed_because=str(error), host_seconds=time.perf_counter() - begin)
+        return f"run and check need {check_needs / 2**30:.2f} GiB of memory, {here / 2**30:.2f} are free"
+    return None
 
 
-def _run(
-    case: Case,
-    device: Device,
-    inputs: Inputs,
-    about: dict[str, Any],
-    sampling: Sampling | None,
-    begin: float,
-    model: Model | None,
-) -> Record:
-    variant, axes, dataset = case.variant, case.axes, inputs.dataset
-    assert dataset is not None
+def _checked(case: Case, device: Device, inputs: Inputs, about: dict[str, Any]) -> tuple[planning.Plan, Any, Any]:
+    """Plan, reports of one run of it, and the verdict on its result; what was found goes into ``about``."""
+    variant, axes, dataset = case.variant, case.axes, inputs.select(case.dataset)
     dataset.check_support(axes["spline"], np.dtype(axes["dtype"]))
     nodes = inputs.rounded_nodes(axes) if variant.transfer == "g2p" else None
     plan = planning.build_plan(variant, dataset, device, axes, nodes=nodes)
-    preprocess, transfer, finish = plan.run_once(device)
+    preprocess, transfer, finish = reports = plan.run_once(device)
     check = check_outputs(plan.outputs(), variant.transfer, inputs, axes)
-    # A wrong row keeps no figures: its counts are those of another computation.
-    counters = transfer.counters if check.passed else None
-    about |= kernel_facts(device, plan.transfer.launches, counters)
     findings = [f for report in (*preprocess.values(), transfer, *finish.values()) for f in report.findings]
     about |= {"check": Check.of(check), "findings": tuple(findings)}
-    if device.name == "simulated":
-        if counters is not None:
-            about["preprocess"] = {name: StepCost(counters=report.counters) for name, report in preprocess.items()}
-            about["finish"] = {name: StepCost(counters=report.counters) for name, report in finish.items()}
-            if model is not None:
-                about["modelled"] = model(preprocess, transfer, finish)
-    elif check.passed:
-        times = measure_plan(device, plan, check, sampling)  # type: ignore[arg-type]
-        about["transfer_measurement"] = times.transfer
-        about["preprocess"] = {name: StepCost(measurement=m) for name, m in times.preprocess.items()}
-        about["finish"] = {name: StepCost(measurement=m) for name, m in times.finish.items()}
-    return Record(**about, host_seconds=time.perf_counter() - begin)
+    return plan, reports, check
 
 
 def kernel_facts(device: Device, launches: Sequence[Launch], counters: Counters | None) -> dict[str, Any]:
@@ -273,15 +339,12 @@ def free_bytes(device: Device) -> int:
     return machine_bytes()
 
 
-def resume_key(run: Record | Case, device: Device | None = None, inputs: Inputs | None = None) -> tuple[Any, ...]:
-    """What makes two rows the same row: a finished Record and the Case that would repeat it have equal keys."""
-    if isinstance(run, Record):
-        name, fingerprint, where = run.variant, run.dataset.fingerprint, (run.device, run.arch)
-    else:
-        assert device is not None
-        assert inputs is not None
-        name, fingerprint = run.variant.name, inputs.select(run.dataset).fingerprint
-        where = (device.name, device.arch)
-    axes = tuple(sorted((key, format_axis(value)) for key, value in run.axes.items()))
-    row = run.preset_row or {}
-    return (name, axes, fingerprint, where, row.get("table"), row.get("row"))
+def resume_key(record: Record) -> tuple[Any, ...]:
+    """What makes two rows the same row: a finished Record and the case that would repeat it have equal keys."""
+    row, where = record.preset_row or {}, (record.device, record.arch)
+    axes = _axis_key(record.axes)
+    return (record.variant, axes, record.dataset.fingerprint, where, row.get("table"), row.get("row"))
+
+
+def _axis_key(axes: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
+    return tuple(sorted((key, format_axis(value)) for key, value in axes.items()))

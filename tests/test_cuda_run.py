@@ -13,6 +13,7 @@ from fake_cupy import FakeGpu, fake_cupy, on_the_engine
 
 from mpmbench import measure
 from mpmbench.cli import main
+from mpmbench.protocol import rounds
 from mpmbench.record import Record, read_records
 
 QUICK_RUN = ["run", "-d", "cuda", "--quick", "--dataset", "one_cell", "--particles", "60"]
@@ -23,6 +24,7 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> FakeGpu:
     machine = FakeGpu(capability="90", execute=on_the_engine())
     monkeypatch.setitem(sys.modules, "cupy", fake_cupy(machine))
     monkeypatch.setattr(measure, "QUICK", measure.Sampling(min_samples=2, max_samples=2, warmup_limit=0))
+    monkeypatch.setattr(rounds, "QUICK", rounds.Rules(min_rounds=2, max_rounds=2, warmup_limit=0))
     return machine
 
 

@@ -18,11 +18,11 @@ from mpmbench.cli import main
 from mpmbench.environment import Environment
 from mpmbench.errors import InputError
 from mpmbench.presets import PRIMITIVE_TABLES, preset, published_rows
-from mpmbench.primitive_runs import PrimitiveCase, primitive_cases, run_primitive
+from mpmbench.primitive_runs import PrimitiveCase, primitive_cases
 from mpmbench.primitives import Operation, Primitive, discover, get, resolve_axes, why_impossible
 from mpmbench.record import from_json, read_records, to_json
 from mpmbench.report import html_text, markdown_text
-from mpmbench.runner import resume_key
+from mpmbench.runner import Inputs, resume_key
 
 PRIMITIVES = discover()
 NAMES = [p.name for p in PRIMITIVES]
@@ -37,7 +37,7 @@ def device():
 
 def record_of(device, name: str, size: int = SMALL, **axes):
     primitive = get(name)
-    return run_primitive(primitive, device, resolve_axes(primitive, axes), size, 1, ENVIRONMENT)
+    return PrimitiveCase(primitive, size, resolve_axes(primitive, axes), 1).run(device, Inputs(), ENVIRONMENT)
 
 
 # --- layout -----------------------------------------------------------------------------------------------------------
@@ -130,8 +130,8 @@ def test_a_wrong_result_is_a_wrong_record(device) -> None:
 
     axes = resolve_axes(honest, {"element": "int", "operator": "length_add"})
     liar = replace(honest, build=lose_the_last)
-    assert run_primitive(liar, device, axes, SMALL, 1, ENVIRONMENT).status == "wrong"
-    assert run_primitive(honest, device, axes, SMALL, 1, ENVIRONMENT).status == "ok"
+    assert PrimitiveCase(liar, SMALL, axes, 1).run(device, Inputs(), ENVIRONMENT).status == "wrong"
+    assert PrimitiveCase(honest, SMALL, axes, 1).run(device, Inputs(), ENVIRONMENT).status == "ok"
 
 
 def test_what_cannot_run_is_a_row_with_a_reason(device) -> None:
@@ -139,7 +139,7 @@ def test_what_cannot_run_is_a_row_with_a_reason(device) -> None:
     assert record.status == "skipped"
     assert "particles" in (record.skipped_because or "")
     huge = replace(get("scan_shuffle"), operation=replace(get("scan_shuffle").operation, floor=lambda *_: 2**60))
-    record = run_primitive(huge, device, resolve_axes(huge, {}), SMALL, 1, ENVIRONMENT)
+    record = PrimitiveCase(huge, SMALL, resolve_axes(huge, {}), 1).run(device, Inputs(), ENVIRONMENT)
     assert "GiB" in (record.skipped_because or "")
     with pytest.raises(InputError, match="out of range"):
         record_of(device, "scan_shuffle", size=2**31)
@@ -230,7 +230,7 @@ def test_thesis_rows_run_with_their_printed_figures(device) -> None:
         assert case.preset_row is not None
         assert why_impossible(case.primitive, case.axes) is None, case.title
         assert case.shrunk(size=10).preset_row is None
-    first = replace(cases[0], size=SMALL).run(device, ENVIRONMENT)
+    first = replace(cases[0], size=SMALL).run(device, Inputs(), ENVIRONMENT)
     assert first.status == "ok"
     assert first.preset_row is not None
     assert (first.preset_row["table"], first.preset_row["published_us"]) == (5, 243.0)

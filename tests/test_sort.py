@@ -10,6 +10,7 @@ import pytest
 from fake_cupy import FakeGpu, fake_cupy, on_the_engine
 
 from mpmbench import device as devices
+from mpmbench.contest import Timing, run_contest
 from mpmbench.dataset import DATASETS_FOLDER, load_dataset
 from mpmbench.device import run_all
 from mpmbench.environment import Environment
@@ -17,8 +18,10 @@ from mpmbench.errors import InputError
 from mpmbench.measure import Sampling
 from mpmbench.motion import after_steps, in_bin_order
 from mpmbench.operations import compaction, sorting
-from mpmbench.primitive_runs import build_primitive, run_primitive
+from mpmbench.primitive_runs import PrimitiveCase, build_primitive
 from mpmbench.primitives import discover, get, resolve_axes
+from mpmbench.protocol.rounds import Rules
+from mpmbench.runner import Inputs
 
 SEED = 9
 ORDERS = ("random", "after_10", "after_1", "sorted")
@@ -38,7 +41,9 @@ def debugger():
 
 def record_of(device, name: str, size: int, **axes):
     primitive = get(name)
-    return run_primitive(primitive, device, resolve_axes(primitive, axes), size, SEED, Environment.capture(argv=[]))
+    return PrimitiveCase(primitive, size, resolve_axes(primitive, axes), SEED).run(
+        device, Inputs(), Environment.capture(argv=[])
+    )
 
 
 def outputs_of(device, name: str, size: int, **axes):
@@ -210,11 +215,14 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> FakeGpu:
 
 
 def test_the_librarys_sort_is_a_row_on_a_gpu_only(gpu: FakeGpu, device) -> None:
-    cuda, sampling = devices.open_device("cuda"), Sampling(min_samples=2, max_samples=2, warmup_limit=0)
+    cuda = devices.open_device("cuda")
+    rules = Rules(min_rounds=1, max_rounds=1, warmup_limit=0)
+    timing = Timing(rules=rules, sampling=Sampling(min_samples=2, max_samples=2, warmup_limit=0))
     for name, seconds in (("sort_library", 0.003), ("sort_index", 0.001)):
         primitive = get(name)
         axes = resolve_axes(primitive, {"order": "after_1"})
-        record = run_primitive(primitive, cuda, axes, 1000, SEED, Environment.capture(argv=[]), sampling)
+        case = PrimitiveCase(primitive, 1000, axes, SEED)
+        (record,) = run_contest([case], cuda, Inputs(), Environment.capture(argv=[]), timing)
         assert record.status == "ok", record.failed_because
         assert record.transfer_measurement is not None
         assert record.transfer_measurement.median == pytest.approx(seconds, rel=0.1)

@@ -25,8 +25,9 @@ from mpmbench.operations.decomposition import (
     reference,
     svd_errors,
 )
-from mpmbench.primitive_runs import run_primitive
+from mpmbench.primitive_runs import PrimitiveCase
 from mpmbench.primitives import get
+from mpmbench.runner import Inputs
 from mpmbench.simt.nvrtc import compile_cuda
 
 DTYPES = ("float32", "float64")
@@ -325,7 +326,7 @@ def test_primitives_move_each_number_once_and_lanes_stay_together(kernel: str, d
     primitive = get(kernel)
     environment = Environment.capture()
     for size in (0, 1, 1000, 4096):
-        record = run_primitive(primitive, counting, {"dtype": dtype}, size, 1, environment)
+        record = PrimitiveCase(primitive, size, {"dtype": dtype}, 1).run(counting, Inputs(), environment)
         assert record.check.passed
         assert not record.findings
     total = record.transfer_counters.total

@@ -1,7 +1,8 @@
-"""The device protocol: one kernel text, two places to run it.
+"""The device protocol: one kernel text, and the places to run it.
 
 ``cuda`` (``cuda:1`` is the second GPU) gives results and event times; ``simulated`` runs the same PTX on the CPU
-and gives results, counters and findings, but never a time of its own.
+and gives results, counters and findings, but never a time of its own. ``cpu`` runs it there by wall clock, for tables
+of their own.
 """
 
 from __future__ import annotations
@@ -130,7 +131,7 @@ def run_all(device: Device, launches: Sequence[Launch]) -> LaunchReport:
 
 
 def open_device(name: str, **options: Any) -> Device:
-    """Open ``simulated``, ``cuda`` or ``cuda:N``.
+    """Open ``simulated``, ``cpu``, ``cuda`` or ``cuda:N``.
 
     Options of ``simulated``: arch ("sm_52", ...), mode ("run", "count", "debug", "profile"), seed (warp order in
     debug mode), machine (what mode profile models).
@@ -140,8 +141,12 @@ def open_device(name: str, **options: Any) -> Device:
         from mpmbench.device.simulated import SimulatedDevice
 
         return SimulatedDevice(**options)
+    if name == "cpu":
+        from mpmbench.device.cpu import CpuDevice
+
+        return CpuDevice(**options)
     if isinstance(name, str) and (name == "cuda" or name.startswith("cuda:")):
         from mpmbench.device.cuda import CudaDevice
 
         return CudaDevice(name, **options)
-    raise InputError(f"unknown device {name!r}: valid are 'simulated', 'cuda' and 'cuda:N'")
+    raise InputError(f"unknown device {name!r}: valid are 'simulated', 'cpu', 'cuda' and 'cuda:N'")

@@ -14,17 +14,12 @@ from enum import StrEnum
 from functools import cached_property
 from typing import Any
 
+from mpmbench.contest import BASELINES, PROBLEM_AXES
 from mpmbench.measure import too_fast_to_rank
 from mpmbench.record import PER_TRANSFER_STEPS, DatasetSummary, Record, StepCost, total_cost
 from mpmbench.simt.counters import SourceLine, Tally
 
 SECTOR_BYTES = 32
-
-# Unsorted global atomics (or gathers): what a user has before reading any of this, and what break-even is against.
-BASELINES = {"p2g": "p2g_global_atomic", "g2p": "g2p_global_gather"}
-
-# Axes that change the problem and not the way it is solved: rows that differ in them are never in one table.
-PROBLEM_AXES = ("spline", "payload", "dtype")
 
 HOTTEST_LINES = 5
 
