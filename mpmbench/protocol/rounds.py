@@ -247,6 +247,8 @@ class _Rounds:
         """Where all arms stand, at one confidence."""
         seconds, margin = self.seconds, self.rules.margin
         noise = _ratio(seconds[0], seconds[-1], confidence)
+        if self._unusable():
+            return _Standing({}, {}, None, noise)
         others = [place for place in range(1, len(self.arms) - 1) if place not in self.spoiled]
         paired = {place: self._compare(0, place, noise, confidence, margin) for place in others}
         timed = [place for place in (0, *others) if place not in self.spoiled and seconds[place]]
@@ -268,11 +270,13 @@ class _Rounds:
         """Why to stop now, or "" to go on. A limit names what it left open."""
         pairs = [(place, one) for group in (standing.paired, standing.behind) for place, one in group.items()]
         decided = (Verdict.FAST, Verdict.SLOW, Verdict.SAME)
-        if last == "throttled baseline":
+        if self._unusable():
             return last
-        if standing.leader is not None and all(one.verdict in decided for _, one in pairs):
+        if not pairs:  # one strategy alone: there is nothing to decide but how well its time is known
+            return "precision" if standing.noise.half_width <= self.rules.margin else last
+        if all(one.verdict in decided for _, one in pairs):
             return "verdict"
-        if pairs and all(one.speedup.half_width <= self.rules.precision for _, one in pairs):
+        if all(one.speedup.half_width <= self.rules.precision for _, one in pairs):
             return "precision"
         if not last:
             return ""

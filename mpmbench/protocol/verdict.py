@@ -52,7 +52,7 @@ class Interval:
 class Paired:
     """One arm against the baseline.
 
-    speedup: baseline's time over this arm's, pair by pair.  margin: what counts as a difference here.
+    speedup: baseline's time over this arm's, pair by pair.  margin: a difference has to be clear of it.
     p_value: of the sign test that the speedup lies beyond the margin by chance; 1 where it does not lie beyond.
     """
 
@@ -82,26 +82,26 @@ def compare(
 ) -> Paired:
     """Judge ``other`` against ``baseline``: times [s] of the same passes, in the same order.
 
-    noise: ratio of two copies of the baseline from the same rounds; a spread wider than ``margin`` takes its place.
+    noise: ratio of two copies of the baseline from the same rounds. A spread wider than ``margin`` takes its place
+    where a difference is called, not where equality is: noise hides differences, it does not make equal.
     """
     speedups = [b / o for b, o in zip(baseline, other, strict=True)]
     if not speedups:
         return Paired(Interval(math.nan, -math.inf, math.inf), margin, Verdict.UNUSABLE, 1.0, 0)
     interval = median_interval(speedups, confidence)
-    if noise is not None and math.isfinite(noise.spread):
-        margin = max(margin, noise.spread)
-    return Paired(interval, margin, judge(interval, margin), _sign_test(speedups, margin), len(speedups))
+    equal, margin = margin, max(margin, noise.spread if noise and math.isfinite(noise.spread) else 0.0)
+    return Paired(interval, margin, judge(interval, margin, equal), _sign_test(speedups, margin), len(speedups))
 
 
-def judge(speedup: Interval, margin: float = MARGIN) -> Verdict:
-    """The word for an interval: clear of 1 +- margin, inside it, or neither."""
+def judge(speedup: Interval, margin: float = MARGIN, equal: float = MARGIN) -> Verdict:
+    """The word for an interval: clear of 1 +- margin, inside 1 +- equal, or neither."""
     if math.isnan(speedup.median):
         return Verdict.UNUSABLE
     if speedup.low > 1 + margin:
         return Verdict.FAST
     if speedup.high < 1 - margin:
         return Verdict.SLOW
-    if speedup.low >= 1 - margin and speedup.high <= 1 + margin:
+    if speedup.low >= 1 - equal and speedup.high <= 1 + equal:
         return Verdict.SAME
     return Verdict.AMBIGUOUS
 
