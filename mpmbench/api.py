@@ -112,9 +112,10 @@ def list_datasets() -> list[Recipe]:
 
 
 def list_devices() -> list[DeviceSummary]:
-    """The simulated device and, where there is one, each GPU; else one line that says why there is none."""
+    """What runs on this CPU and, where there is one, each GPU; else one line that says why there is none."""
     devices = [
-        DeviceSummary("simulated", "runs the CUDA kernels on this CPU: results, counters, findings; no times", True)
+        DeviceSummary("simulated", "runs the CUDA kernels on this CPU: results, counters, findings; no times", True),
+        DeviceSummary("cpu", "runs them on one core as fast as it can: wall clock, in tables of their own", True),
     ]
     try:
         open_device("cuda")
