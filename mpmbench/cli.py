@@ -1,4 +1,4 @@
-"""The command line: ``mpmbench list | run | check | profile | report | verify | reproduce | selftest | doctor | env``.
+"""The command line: ``mpmbench list | run | check | profile | report | compare | verify | reproduce | doctor | ...``.
 
 Names and axis syntax follow NVBench. Exit codes: 0 ok, 1 harness error, 2 usage or bad input, 3 regression, 4 wrong
 results or findings, 130 interrupted.
@@ -308,6 +308,9 @@ def _axis_values(variant: Any) -> dict[str, list[Any]]:
 @click.option("--md", "md_path", type=click.Path(path_type=Path), metavar="FILE", help="Markdown report.")
 @click.option("--csv", "csv_path", type=click.Path(path_type=Path), metavar="FILE", help="One flat row per record.")
 @click.option(
+    "--nvbench", "nvbench_path", type=click.Path(path_type=Path), metavar="FILE", help="For NVBench's tools: JSON."
+)
+@click.option(
     "--gpu",
     "gpu_names",
     multiple=True,
@@ -330,6 +333,7 @@ def run(
     html_path: Path | None,
     md_path: Path | None,
     csv_path: Path | None,
+    nvbench_path: Path | None,
     gpu_names: Sequence[str],
     rigorous: bool,
     baseline: str,
@@ -355,9 +359,10 @@ def run(
         raise InputError("--quick and --rigorous exclude each other: leave one of them out")
     if resume and json_path is None:
         raise InputError("--resume needs --json FILE, the file whose rows it keeps")
-    _refuse_targets([json_path, html_path, md_path, csv_path], selection["datasets"])
+    outputs = [json_path, html_path, md_path, csv_path, nvbench_path]
+    _refuse_targets(outputs, selection["datasets"])
     if gpu_names:
-        _run_modelled(cases, gpu_names, devices, arch, json_path, html_path, md_path, csv_path, resume, dry_run)
+        _run_modelled(cases, gpu_names, devices, arch, outputs, resume, dry_run)
         return
     # The thesis measured a GTX 970: its rows are counted on the code that NVRTC makes for that GPU.
     opened = _open_devices(devices, arch or ("sm_52" if preset_name == "thesis" else None), "count")
@@ -375,8 +380,8 @@ def run(
     timings = _timings(caches, quick, rigorous, baseline)
     _refuse_unknown_baseline(cases, baseline)
     records = _run_cases(cases, opened, json_path, "append" if resume else "replace", timings)
-    _write_reports(records, html_path, md_path, csv_path)
-    _summarise(records, [p for p in (json_path, html_path, md_path, csv_path) if p])
+    _write_reports(records, html_path, md_path, csv_path, nvbench_path)
+    _summarise(records, [p for p in outputs if p])
 
 
 @main.command()
@@ -410,7 +415,14 @@ def check(
 @click.option("--html", "html_path", type=click.Path(path_type=Path), metavar="FILE")
 @click.option("--md", "md_path", type=click.Path(path_type=Path), metavar="FILE")
 @click.option("--csv", "csv_path", type=click.Path(path_type=Path), metavar="FILE")
-def report(records: Sequence[Path], html_path: Path | None, md_path: Path | None, csv_path: Path | None) -> None:
+@click.option("--nvbench", "nvbench_path", type=click.Path(path_type=Path), metavar="FILE")
+def report(
+    records: Sequence[Path],
+    html_path: Path | None,
+    md_path: Path | None,
+    csv_path: Path | None,
+    nvbench_path: Path | None,
+) -> None:
     """Rebuild a report from RECORDS files, on any machine. Prints Markdown if no file is named."""
     from mpmbench.record import read_records
     from mpmbench.report import markdown_text
@@ -418,10 +430,11 @@ def report(records: Sequence[Path], html_path: Path | None, md_path: Path | None
     rows = [row for path in records for row in read_records(path)]
     if not rows:
         raise InputError(f"no records in {', '.join(map(str, records))}: nothing to report")
-    _refuse_targets([html_path, md_path, csv_path], records)
-    if html_path or md_path or csv_path:
-        _write_reports(rows, html_path, md_path, csv_path)
-        for path in filter(None, (html_path, md_path, csv_path)):
+    outputs = [html_path, md_path, csv_path, nvbench_path]
+    _refuse_targets(outputs, records)
+    if any(outputs):
+        _write_reports(rows, *outputs)
+        for path in filter(None, outputs):
             console.print(f"wrote {path}", markup=False, soft_wrap=True)
     else:
         click.echo(markdown_text(rows))
@@ -527,10 +540,7 @@ def _run_modelled(
     gpu_names: Sequence[str],
     devices: Sequence[str],
     arch: str | None,
-    json_path: Path | None,
-    html_path: Path | None,
-    md_path: Path | None,
-    csv_path: Path | None,
+    outputs: Sequence[Path | None],
     resume: bool,
     dry_run: bool,
 ) -> None:
@@ -545,9 +555,10 @@ def _run_modelled(
             console.print(f"{', '.join(gpu.name for gpu in gpus)}  {case.title}", markup=False, soft_wrap=True)
         console.print(f"{len(cases)} cases on {len(gpus)} GPUs")
         return
+    json_path, *reports = outputs
     records = cli_profile.model_cases(cases, gpus, json_path, resume)
-    _write_reports(records, html_path, md_path, csv_path)
-    _summarise(records, [p for p in (json_path, html_path, md_path, csv_path) if p])
+    _write_reports(records, *reports)
+    _summarise(records, [p for p in outputs if p])
 
 
 # --- running ----------------------------------------------------------------------------------------------------------
@@ -639,9 +650,14 @@ def _refuse_targets(paths: Sequence[Path | None], inputs: Iterable[str | Path] =
         taken[path.resolve()] = "is written by the same command"
 
 
-def _write_reports(records: list[Any], html: Path | None, md: Path | None, csv: Path | None) -> None:
+def _write_reports(
+    records: list[Any], html: Path | None, md: Path | None, csv: Path | None, nvbench: Path | None = None
+) -> None:
+    from mpmbench.nvbench import write_nvbench
     from mpmbench.report import write_report
 
+    if nvbench:
+        write_nvbench(records, nvbench)
     if html or md:
         write_report(records, html=html, markdown=md)
     if csv:
@@ -684,7 +700,8 @@ def _summarise(records: list[Any], written: Sequence[Path]) -> None:
         sys.exit(1)
 
 
-from mpmbench import cli_profile, cli_sanitize  # noqa: E402, F401  # they add their commands; they need what stands above
+# They add their commands, and need what stands above.
+from mpmbench import cli_compare, cli_profile, cli_sanitize  # noqa: E402, F401
 
 if __name__ == "__main__":
     main()
