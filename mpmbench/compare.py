@@ -179,7 +179,7 @@ def _comparable(row: Row) -> bool:
 
 def _refuse_without_times(rows: Sequence[Row]) -> None:
     if not rows:
-        raise InputError("a file holds no rows: nothing to compare")
+        raise InputError("no rows on one side: nothing to compare")
     if any(not row.without_time for row in rows):
         return
     reason, _ = Counter(row.without_time for row in rows).most_common(1)[0]
@@ -245,13 +245,12 @@ def match(ref: Sequence[Row], cmp: Sequence[Row]) -> tuple[list[tuple[Row, Row]]
 
 
 def _pair_devices(ref: Sequence[Row], cmp: Sequence[Row]) -> dict[tuple[str, str], tuple[str, str]]:
-    """Device of ``cmp`` -> device of ``ref``: the very same one where both have it, the others in their order."""
+    """Device of ``cmp`` -> device of ``ref``, in their order, without those that both have: each pairs with itself."""
     found: dict[tuple[str, str], tuple[str, str]] = {}
     for kind in (EVENTS, WALL):
         before, after = (list(dict.fromkeys(row.device for row in rows if row.kind == kind)) for rows in (ref, cmp))
         common = set(before) & set(after)
         rest = [device for device in before if device not in common]
-        found |= {device: device for device in common}
         found |= dict(zip([device for device in after if device not in common], rest, strict=False))
     return found
 

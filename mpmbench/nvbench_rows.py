@@ -68,9 +68,10 @@ def read_rows(path: str | Path) -> list[Row]:
         raise InputError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from None
     if not first:
         raise InputError(f"{path} is empty: nothing to compare")
-    if _is_record(first):
-        return rows_of_records(read_records(path), path)
-    return read_nvbench(path)
+    rows = rows_of_records(read_records(path), path) if _is_record(first) else read_nvbench(path)
+    if not rows:
+        raise InputError(f"{path} holds no rows: nothing to compare")
+    return rows
 
 
 def _is_record(line: bytes) -> bool:

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 from mpmbench import compare as comparing
 from mpmbench.cli import main
-from mpmbench.compare import Limit, compare
+from mpmbench.compare import Limit, compare, match
 from mpmbench.errors import InputError
 from mpmbench.nvbench import EVENTS, WALL, write_nvbench
 from mpmbench.nvbench_rows import rows_of_records
@@ -153,6 +153,8 @@ def test_only_the_same_row_matches():
         found = outcome([first, other], [first])
         assert (len(found.pairs), len(found.only_ref), found.only_cmp) == (1, 1, ()), what
     assert verdicts([first, *others.values()], [*others.values(), first]) == ["SAME"] * 6
+    [row] = rows_of_records([first], "a.jsonl")
+    assert match([row], [dataclasses.replace(row, kind=WALL)])[0] == []  # whatever its device is called
 
 
 def test_order_does_not_matter_but_repeated_rows_keep_theirs():
@@ -182,6 +184,8 @@ def test_a_row_that_failed_meets_its_partner_and_says_why():
     assert [pair.judgement.verdict for pair in found.pairs] == ["SAME", "????"]
     assert found.pairs[1].judgement.told == "CMP: no launch"
     assert [summary.count for summary in found.summaries] == [1]
+    twice = outcome([timed(), good], [timed(), failed, failed])
+    assert (len(twice.pairs), len(twice.only_cmp)) == (2, 1)
     with pytest.raises(InputError, match=r"no row has a time in both files: .*CMP: no launch"):
         outcome([timed(), good], [untimed(timed(), check=None, failed_because="no launch"), timed("p2g_block_pull")])
 
@@ -353,6 +357,9 @@ def test_names_cannot_break_the_table(tmp_path):
 def test_refusals_are_one_line(tmp_path, files):
     (tmp_path / "empty").write_text("")
     assert "is empty" in refusal(files[0], tmp_path / "empty")
+    (tmp_path / "torn.jsonl").write_bytes(files[0].read_bytes()[:200])
+    with pytest.warns(UserWarning, match="torn"):
+        assert f"{tmp_path / 'torn.jsonl'} holds no rows" in refusal(files[0], tmp_path / "torn.jsonl")
     assert "no such file" in refusal(files[0], tmp_path / "none")
     assert "is a directory" in refusal(files[0], tmp_path)
     assert "neither a journal" in refusal(files[0], Path(__file__))

@@ -13,6 +13,7 @@ from fake_cupy import FakeGpu, fake_cupy, on_the_engine
 
 from mpmbench import measure
 from mpmbench.cli import main
+from mpmbench.nvbench_rows import read_nvbench
 from mpmbench.protocol import rounds
 from mpmbench.record import Record, read_records
 
@@ -55,6 +56,17 @@ def test_records_hold_event_times_of_every_step(gpu: FakeGpu, tmp_path: Path) ->
     report = (tmp_path / "report.md").read_text()
     assert "p2g_block_sync" in report
     assert "measured" in report.lower()
+
+
+def test_event_times_reach_nvbench(gpu: FakeGpu, tmp_path: Path) -> None:
+    result, records = run(tmp_path, "-b", "p2g_global_atomic", "--nvbench", str(tmp_path / "n.json"))
+    assert result.exit_code == 0, result.output
+    [row] = read_nvbench(tmp_path / "n.json")
+    assert records[0].transfer_measurement is not None
+    assert row.seconds("max") == max(records[0].transfer_measurement.samples)
+    assert (row.kind, row.environment["gpu.name"]) == ("measured (events)", "Fake GPU")
+    compared = CliRunner().invoke(main, ["compare", str(tmp_path / "records.jsonl"), str(tmp_path / "n.json")])
+    assert compared.exit_code == 0, compared.output
 
 
 def test_a_wrong_result_has_no_time(gpu: FakeGpu, tmp_path: Path) -> None:
