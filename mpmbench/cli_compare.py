@@ -88,7 +88,8 @@ def compare(
     outcome = comparing.compare(read_rows(ref), read_rows(cmp), preset, allowed, benchmarks, axes)
     if outcome.refused:
         for one in outcome.refused:
-            notes.print(f"{one.key}: {one.ref} (REF), {one.cmp} (CMP), {one.rows} rows", markup=False, soft_wrap=True)
+            told = f"{one.key}: {one.ref} (REF), {one.cmp} (CMP), {compare_text.count(one.rows)}"
+            notes.print(told, markup=False, soft_wrap=True)
         keys = ",".join(dict.fromkeys(one.key for one in outcome.refused))
         raise InputError(
             f"the environments of {ref} and {cmp} differ: measure again alike, or add --allow-different {keys}"

@@ -52,7 +52,8 @@ class Pair:
     @property
     def center(self) -> str:
         """What is printed: the median, or the mean where a file of an older NVBench has no median."""
-        return "mean" if None in (self.ref.seconds("median"), self.cmp.seconds("median")) else "median"
+        timed = [row for row in (self.ref, self.cmp) if not row.without_time]
+        return "mean" if any(row.seconds("median") is None for row in timed) else "median"
 
     def change(self, figure: str) -> float | None:
         """CMP over REF in one figure of the times."""

@@ -44,7 +44,7 @@ def summary_lines(outcome: Outcome, limits: Sequence[Limit] = ()) -> list[str]:
     for one in outcome.summaries:
         verdicts = ", ".join(f"{one.verdicts[word]} {word}" for word in WORDS if word in one.verdicts)
         lines.append(
-            f"**{one.kind}**: geometric mean of CMP/REF {one.ratio:.4f} over {one.count} rows;"
+            f"**{one.kind}**: geometric mean of CMP/REF {one.ratio:.4f} over {count(one.count)};"
             f" worst {one.worst.ratio:.4f}, {_plain(one.worst.cmp.title)}; {verdicts}"
         )
     seen = {pair.judgement.verdict for pair in outcome.pairs}
@@ -53,7 +53,7 @@ def summary_lines(outcome: Outcome, limits: Sequence[Limit] = ()) -> list[str]:
         failed = limit.failed(outcome.pairs)
         unsure = sum(limit.exceeded(pair) for pair in outcome.pairs) - len(failed)
         also = f"; {unsure} more exceed it but are not SLOW, and do not count" if unsure else ""
-        lines.append(f"--fail-on {limit}: {len(failed)} rows failed{also}")
+        lines.append(f"--fail-on {limit}: {count(len(failed))} failed{also}")
         lines += [f"- {_plain(pair.cmp.title)}: {pair.change(limit.figure):.4f}" for pair in failed]
     return lines
 
@@ -67,7 +67,7 @@ def _differences(outcome: Outcome) -> str:
 
 def _pairs(kind: str, pairs: Sequence[Pair]) -> str:
     """One table; axes that all rows share stand above it."""
-    texts = [_axes(pair.cmp) for pair in pairs]
+    texts = [_axes(pair) for pair in pairs]
     names = list(dict.fromkeys(name for axes in texts for name in axes))
     values = {name: {axes.get(name, ABSENT) for axes in texts} for name in names}
     shared = [f"{name}={next(iter(values[name]))}" for name in names if len(values[name]) == 1]
@@ -90,8 +90,14 @@ def _pairs(kind: str, pairs: Sequence[Pair]) -> str:
     return f"**{kind}**{common}\n\n{_table(heads, rows)}"
 
 
-def _axes(row: Row) -> dict[str, str]:
-    return {**dict(row.axes), "cache": row.cache, "device": row.device[0]}
+def _axes(pair: Pair) -> dict[str, str]:
+    """A row that was not timed may not know its cache state: its partner does."""
+    cache = pair.ref.cache if pair.cmp.cache == ABSENT else pair.cmp.cache
+    return {**dict(pair.cmp.axes), "cache": cache, "device": pair.cmp.device[0]}
+
+
+def count(rows: int) -> str:
+    return f"{rows} row" if rows == 1 else f"{rows} rows"
 
 
 def _time(row: Row, figure: str) -> str:

@@ -325,7 +325,7 @@ def test_compare_prints_and_writes_everything(tmp_path, files):
 
 def test_exit_code_three_for_a_regression(files):
     text = invoke(*files, "--fail-on", "median:4%", code=3)
-    assert "--fail-on median:4%: 1 rows failed" in text
+    assert "--fail-on median:4%: 1 row failed" in text
     invoke(*files, "--fail-on", "median:6%")
     invoke(*files, "--fail-on", "min:4%", "--fail-on", "median:90%", code=3)
     invoke(*files, "--fail-on", "median:4%", "-b", "p2g_global_*")
@@ -334,7 +334,7 @@ def test_exit_code_three_for_a_regression(files):
 def test_differing_files_are_refused_with_a_list(tmp_path, files):
     other = journal(tmp_path / "other.jsonl", changed(timed(times=samples(3)), name="Other GPU", cupy="15"))
     *listed, last = invoke(files[0], other, code=2).strip().splitlines()
-    assert listed == ["gpu.name: Test GPU (REF), Other GPU (CMP), 1 rows", "gpu.cupy: 14.2.0 (REF), 15 (CMP), 1 rows"]
+    assert listed == ["gpu.name: Test GPU (REF), Other GPU (CMP), 1 row", "gpu.cupy: 14.2.0 (REF), 15 (CMP), 1 row"]
     assert last.endswith("add --allow-different gpu.name,gpu.cupy")
     text = invoke(files[0], other, "--allow-different", "gpu.name,gpu.cupy")
     assert "gpu.name" in text
@@ -346,6 +346,16 @@ def test_differing_files_are_refused_with_a_list(tmp_path, files):
 def test_a_journal_against_an_nvbench_file(tmp_path, files):
     assert CliRunner().invoke(main, ["report", str(files[1]), "--nvbench", str(tmp_path / "c.json")]).exit_code == 0
     assert "1 SLOW, 2 SAME" in invoke(files[0], tmp_path / "c.json")
+
+
+def test_a_failed_row_stands_in_the_table_as_its_partner(tmp_path):
+    rows = [timed(), timed("p2g_block_sync")]
+    failed = untimed(rows[1], check=None, failed_because="no launch")
+    text = invoke(journal(tmp_path / "a.jsonl", *rows), journal(tmp_path / "b.jsonl", rows[0], failed))
+    assert "cache=cold" in text
+    assert "REF median " in text
+    assert "| ????      | CMP: no launch" in text
+    assert "over 1 row;" in text
 
 
 def test_names_cannot_break_the_table(tmp_path):
