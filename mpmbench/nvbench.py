@@ -43,6 +43,11 @@ def kind_of(record: Record) -> str:
     return WALL if record.device.partition(":")[0] == "cpu" else EVENTS
 
 
+def cache_of(record: Record) -> str | None:
+    """State of the caches, of a row that was not timed the one it was meant for; older journals do not know that."""
+    return record.transfer_measurement.mode if record.transfer_measurement else record.cache
+
+
 def why_no_time(record: Record) -> str:
     """Empty where the transfer was measured."""
     if record.transfer_measurement:
@@ -116,7 +121,7 @@ def document(records: Sequence[Record], name: str) -> tuple[dict[str, Any], dict
     for index, (benchmark, rows) in enumerate(benchmarks.items()):
         axes = list(dict.fromkeys(axis for row in rows for axis in row.axes))
         modes = {row.transfer_measurement.mode for row in rows if row.transfer_measurement}
-        mode = modes.pop() if len(modes) == 1 else ABSENT  # a row that was not timed would have had it
+        mode = modes.pop() if len(modes) == 1 else ABSENT  # what a row of an older journal would have had
         states: list[dict[str, Any]] = []
         for row in rows:
             environment = _strict(_plain(asdict(row.environment)))
@@ -159,7 +164,7 @@ def _own(record: Record, environment: int) -> dict[str, Any]:
         "dataset": record.dataset.name,
         "fingerprint": record.dataset.fingerprint,
         "axes": {name: format_axis(value) for name, value in record.axes.items()},
-        "cache": record.transfer_measurement.mode if record.transfer_measurement else ABSENT,
+        "cache": cache_of(record) or ABSENT,
         "kind": kind_of(record),
         "device": list(device_identity(record)),
         "environment": environment,
@@ -223,7 +228,7 @@ def _state(
         "strategy": record.variant,
         "dataset": record.dataset.name,
         **{axis: format_axis(record.axes[axis]) if axis in record.axes else ABSENT for axis in axes},
-        "cache": time.mode if time else mode,
+        "cache": cache_of(record) or mode,
     }
     values = [{"name": axis, "type": "string", "value": text} for axis, text in texts.items()]
     values.insert(2, {"name": "particles", "type": "int64", "value": str(record.dataset.n)})

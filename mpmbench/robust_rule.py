@@ -51,7 +51,9 @@ class RobustRule:
             except ValueError as error:
                 raise InputError(f"{ref.path}, {cmp.path}: {error}: write the file anew") from None
             found = self._tool.compare_gpu_timings(*timings, self._thresholds)
-        told = "judged by wall time alone: no clock" if ref.kind == WALL else found.reason.message
+        told = found.reason.message
+        if ref.kind == WALL and found.status.value != "AMBG":
+            told = "judged by wall time alone: no clock"
         return Judgement(found.status.value, found.reason.code, "; ".join([told, *(str(w.message) for w in caught)]))
 
     def _timing(self, row: Row) -> Any:

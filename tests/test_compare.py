@@ -120,6 +120,9 @@ def test_wall_times_need_no_clock():
     [pair] = outcome([wall(times=samples(1))], [wall(times=samples(2, 1.05e-3))]).pairs
     assert (pair.judgement.verdict, pair.judgement.told) == ("SLOW", "judged by wall time alone: no clock")
     assert verdicts([wall(times=samples(1))], [wall(times=samples(2))]) == ["SAME"]
+    [pair] = outcome([wall(times=samples(1, noise=0.1))], [wall(times=samples(2, 1.02e-3, noise=0.1))]).pairs
+    assert (pair.judgement.verdict, pair.judgement.reason) == ("AMBG", "centers_not_close")
+    assert "not close enough" in pair.judgement.told
     assert verdicts([timed(times=samples(1), hertz=None)], [timed(times=samples(2, 1.05e-3), hertz=None)]) == ["AMBG"]
 
 

@@ -255,6 +255,13 @@ def test_axes_that_a_strategy_lacks_are_not_its_axes():
     assert {value["name"]: value["value"] for value in rows[1].state["axis_values"]}["batching"] == "-"
 
 
+def test_a_row_that_was_not_timed_keeps_the_cache_state_it_was_meant_for():
+    failed = untimed(timed("p2g_block_sync", cache="hot"), check=None, failed_because="no launch")
+    row = rows_of_records([timed(), failed], "a.jsonl")[1]
+    assert row.cache == "hot"
+    assert row.state["axis_values"][-1]["value"] == "hot"
+
+
 def test_a_file_of_nvbench_itself(tmp_path):
     """Made by hand after its format: no key of ours, a mean only in one state, numbers as text."""
     value = {"name": "value", "type": "float64", "value": "2.5e-06"}
