@@ -73,7 +73,7 @@ def _selection(command: Callable[..., Any]) -> Callable[..., Any]:
     """The options that choose variants, datasets, axes and the device; shared by run and check."""
     options = [
         click.option("-b", "--benchmark", "patterns", multiple=True, metavar="GLOB",
-                     help="Variants and primitives by name or glob. Default: every variant."),
+                     help="Variants, primitives and peers by name or glob. Default: every variant; peers with -d cpu."),
         click.option("--dataset", "datasets", multiple=True, metavar="NAME|FILE",
                      help="Recipe name, or a .npz/.npy file of your own particles. Default: uniform_cube."),
         click.option("-a", "--axis", "axes", multiple=True, metavar="AXIS=VALUES",
@@ -111,10 +111,12 @@ def _choose(
     variant_dirs: Sequence[Path],
     quick: bool,
     preset_name: str | None = None,
+    devices: Sequence[str] = (),
 ) -> list[Any]:
     """The cases that the options ask for."""
-    from mpmbench import presets, primitives, variants
+    from mpmbench import peers, presets, primitives, variants
     from mpmbench.dataset import list_datasets
+    from mpmbench.peer_runs import peer_cases
     from mpmbench.primitive_runs import primitive_cases
     from mpmbench.runner import DatasetChoice, cases_of
 
@@ -130,9 +132,13 @@ def _choose(
             cases = [case for case in cases if case.name in wanted]
         return [case.shrunk(particles=limit, size=size) for case in cases]
     shipped = list(variants.discover(variant_dirs))
-    chosen = _match([*shipped, *primitives.discover(variant_dirs)], patterns) if patterns else shipped
+    if patterns:
+        chosen = _match([*shipped, *primitives.discover(variant_dirs), *peers.discover()], patterns)
+    else:
+        chosen = [*shipped, *peers.by_default(devices)]
     transfers = [strategy for strategy in chosen if isinstance(strategy, variants.Variant)]
     blocks = [strategy for strategy in chosen if isinstance(strategy, primitives.Primitive)]
+    others = [strategy for strategy in chosen if isinstance(strategy, peers.Peer)]
     given: dict[str, list[Any]] = {}
     for name, values in map(_parse_axis, axes):
         if name in given:
@@ -155,7 +161,11 @@ def _choose(
         for name in datasets or ("uniform_cube",)
     ]
     of_transfers = {name: values for name, values in given.items() if any(name in t.axes for t in transfers)}
-    return [*cases_of(transfers, choices, of_transfers), *primitive_cases(blocks, given, size, seed)]
+    return [
+        *cases_of(transfers, choices, of_transfers),
+        *peer_cases(others, choices, given),
+        *primitive_cases(blocks, given, size, seed),
+    ]
 
 
 QUICK_PARTICLES = 20_000
@@ -247,7 +257,7 @@ def _gpu_present() -> bool:
 @click.option("--json", "as_json", is_flag=True, help="Machine-readable.")
 def list_command(variant_dirs: Sequence[Path], as_json: bool) -> None:
     """Variants and primitives with their axes, datasets, presets and devices. Runs nothing."""
-    from mpmbench import presets, primitives
+    from mpmbench import peers, presets, primitives
     from mpmbench.api import list_datasets, list_devices
     from mpmbench.variants import discover
 
@@ -257,6 +267,10 @@ def list_command(variant_dirs: Sequence[Path], as_json: bool) -> None:
         content = {
             "variants": {v.name: {"summary": v.summary, "axes": _axis_values(v)} for v in variants},
             "primitives": {p.name: {"summary": p.summary, "axes": _axis_values(p)} for p in blocks},
+            "peers": {
+                p.name: {"summary": p.summary, "axes": _axis_values(p), "installed": p.library.installed}
+                for p in peers.discover()
+            },
             "datasets": {d.name: d.summary for d in list_datasets()},
             "presets": list(presets.PRESETS),
             "devices": {d.name: d.summary for d in list_devices()},
@@ -266,6 +280,7 @@ def list_command(variant_dirs: Sequence[Path], as_json: bool) -> None:
     for title, rows in (
         ("Variants", [(v.name, v.summary) for v in variants]),
         ("Primitives", [(p.name, p.summary) for p in blocks]),
+        ("Peers, on the device cpu", [(p.name, _with_cure(p)) for p in peers.discover()]),
         ("Datasets", [(d.name, d.summary) for d in list_datasets()]),
         ("Presets", [(name, (make.__doc__ or "").split("\n")[0]) for name, make in presets.PRESETS.items()]),
         ("Devices", [(d.name, d.summary) for d in list_devices()]),
@@ -294,6 +309,12 @@ def _print_axes(title: str, strategies: Sequence[tuple[str, Any]]) -> None:
         others = [f"{who}: {value}" for who, value in defaults.items() if value != usual]
         table.add_row(name, "  ".join(values), ", ".join(others))
     console.print(table)
+
+
+def _with_cure(peer: Any) -> str:
+    from mpmbench.peers import INSTALL
+
+    return peer.summary if peer.library.installed else f"{peer.summary}; not installed: {INSTALL}"
 
 
 def _axis_values(variant: Any) -> dict[str, list[Any]]:
@@ -354,7 +375,7 @@ def run(
     mpmbench run --gpu h100,a100,rtx4090 --dataset my_particles.npz --html which_one.html
     """
     caches, selection["axes"] = _cache_states(selection["axes"])
-    cases = _choose(**selection, quick=quick, preset_name=preset_name)
+    cases = _choose(**selection, quick=quick, preset_name=preset_name, devices=devices)
     if quick and rigorous:
         raise InputError("--quick and --rigorous exclude each other: leave one of them out")
     if resume and json_path is None:
@@ -394,7 +415,7 @@ def check(
     debug: bool, json_path: Path | None, devices: Sequence[str], arch: str | None, quick: bool, **selection: Any
 ) -> None:
     """Hold variants to the float64 reference, without counting or timing. Exit code 4 if one fails."""
-    cases = _choose(**selection, quick=quick)
+    cases = _choose(**selection, quick=quick, devices=devices)
     _refuse_targets([json_path], selection["datasets"])
     opened = _open_devices(devices, arch, "debug" if debug else "run")
     records = _run_cases(cases, opened, json_path, "replace")

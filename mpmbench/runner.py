@@ -152,7 +152,7 @@ def refuse_bad_input(cases: Iterable[Any]) -> None:
     InputError. To be called before any file is touched and before an hour of work."""
     uses: dict[DatasetChoice, dict[tuple[str, str], None]] = {}
     for case in cases:
-        if isinstance(case, Case):
+        if hasattr(case, "dataset"):  # primitives have none
             uses.setdefault(case.dataset, {})[case.axes["spline"], case.axes["dtype"]] = None
     for choice, kinds in uses.items():
         dataset = choice.load()
@@ -208,8 +208,8 @@ def run_case(
 
     model: asked for modelled times once the result is known to be right; for a device in mode profile.
     """
-    about = _about(case, device, inputs, environment)
-    if reason := _why_not_here(case, device, inputs, about):
+    about = about_case(case, device, inputs, environment)
+    if reason := why_not_here(case, device, inputs, about):
         return Record(**about, skipped_because=reason)
     begin = time.perf_counter()
     try:
@@ -235,8 +235,8 @@ def prepare_case(
 
     cache: state of the caches before each sample, see ``Measurement.mode``; "step" brings the rest of the step along.
     """
-    about = _about(case, device, inputs, environment)
-    if reason := _why_not_here(case, device, inputs, about):
+    about = about_case(case, device, inputs, environment)
+    if reason := why_not_here(case, device, inputs, about):
         return Record(**about, skipped_because=reason)
     begin = time.perf_counter()
     try:
@@ -262,7 +262,7 @@ def prepare_case(
     )
 
 
-def _about(case: Case, device: Device, inputs: Inputs, environment: Environment) -> dict[str, Any]:
+def about_case(case: Case, device: Device, inputs: Inputs, environment: Environment) -> dict[str, Any]:
     """What a record says before anything has run."""
     variant, axes = case.variant, case.axes
     dataset = inputs.select(case.dataset)
@@ -284,7 +284,7 @@ def _about(case: Case, device: Device, inputs: Inputs, environment: Environment)
     return about
 
 
-def _why_not_here(case: Case, device: Device, inputs: Inputs, about: dict[str, Any]) -> str | None:
+def why_not_here(case: Case, device: Device, inputs: Inputs, about: dict[str, Any]) -> str | None:
     """Why a case cannot exist, or does not fit."""
     if reason := why_impossible(case.variant, case.axes):
         return reason
