@@ -21,14 +21,12 @@ from typing import Any
 
 import machine
 import numpy as np
-import rounds
-from engine_arm import EngineTransfer, open_engine
-from scenes import load
 
-from mpmbench import reference
-from mpmbench.check import check_g2p, check_p2g
+from mpmbench.device import Device, open_device, run_all
+from mpmbench.device.cpu import CpuDevice
 from mpmbench.kernel import KernelSource, load_source
-from mpmbench.reference import Nodes
+from mpmbench.plan import build_plan, run_steps
+from mpmbench.runner import DatasetChoice, Inputs, check_outputs
 from mpmbench.simt.ptx import parse
 from mpmbench.variants import Variant, discover, resolve_axes
 from mpmbench.workspace import kernel_constants
@@ -68,6 +66,11 @@ class CountTime:
     warp_inst: int
 
 
+def open_engine(mode: str = "run") -> Device:
+    """The simulated device for the default architecture."""
+    return open_device("simulated", mode=mode)
+
+
 def source_of(variant: Variant) -> KernelSource:
     """The strategy's kernel at default axes."""
     return load_source(variant.kernel_path, kernel_constants(resolve_axes(variant, {})))
@@ -95,28 +98,42 @@ def compile_times(variant: Variant, mode: str, repeats: int) -> CompileTime:
     return CompileTime(variant.name, mode, *(float(m) for m in np.median(np.array(samples), axis=0)))
 
 
+def all_compile_times(repeats: int) -> list[CompileTime]:
+    """Every strategy in every mode."""
+    variants = discover()
+    kept_folder = os.environ.get("MPMBENCH_CACHE_DIR")
+    try:
+        for mode in MODES:  # imports, NVRTC and LLVM's tables are loaded once, by a kernel that is not timed
+            compile_times(variants[0], mode, repeats=1)
+        return [compile_times(variant, mode, repeats) for variant in variants for mode in MODES]
+    finally:
+        if kept_folder is None:
+            os.environ.pop("MPMBENCH_CACHE_DIR", None)
+        else:
+            os.environ["MPMBENCH_CACHE_DIR"] = kept_folder
+
+
 def count_times(names: tuple[str, ...], particles: int, repeats: int) -> list[CountTime]:
-    """Count sorted transfers of ``uniform_cube``; a result that fails the check is an error."""
-    scene = load("uniform_cube", particles, deep=True)
-    answer = reference.p2g(scene.dataset, "cubic", "pic", "float32")
-    velocity = np.random.default_rng(1).uniform(-1, 1, (*scene.grid.shape, 3)).astype(np.float32)
-    given = Nodes(mass=np.ones(scene.grid.shape, np.float32), momentum=velocity)
-    gathered = reference.g2p(scene.dataset, velocity, "cubic", "pic", "float32")
+    """Count sorted transfers of ``uniform_cube_shuffled``; a result that fails the check is an error."""
+    inputs = Inputs()
+    dataset = inputs.select(DatasetChoice("uniform_cube_shuffled", particles))
     found = {variant.name: variant for variant in discover()}
     times = []
     for name in names:
         variant, seconds = found[name], {}
+        axes = resolve_axes(variant, {"particle_order": "deep"})
+        nodes = inputs.rounded_nodes(axes) if variant.transfer == "g2p" else None
         for mode in MODES:
-            nodes = given if variant.transfer == "g2p" else None
-            transfer = EngineTransfer(open_engine(mode), name, {"particle_order": "deep"}, scene, nodes)
-            samples = []
+            device = open_engine(mode)
+            plan = build_plan(variant, dataset, device, axes, nodes)
+            plan.run_once(device)
+            launches, samples = plan.transfer.launches, []
             for _ in range(repeats):
-                transfer.reset()
-                duration, report = timed(transfer.run)
+                run_steps(device, plan.reset())
+                duration, report = timed(lambda device=device, launches=launches: run_all(device, launches))
                 samples.append(duration)
-            transfer.finish()
-            check = check_p2g if variant.transfer == "p2g" else check_g2p
-            verdict = check(transfer.outputs(), answer if variant.transfer == "p2g" else gathered)
+            run_steps(device, plan.finish)
+            verdict = check_outputs(plan.outputs(), variant.transfer, inputs, axes)
             if not verdict.passed:
                 raise SystemExit(f"{name} in mode {mode}: {verdict}")
             seconds[mode] = float(np.median(samples))
@@ -189,24 +206,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--repeats", type=int, help="default 3")
     parser.add_argument("--out", type=Path, default=REPORTS, help="folder of the report")
     given = parser.parse_args(arguments)
-    core = rounds.pin_to_one_core()
+    core = max(os.sched_getaffinity(0))
     repeats = given.repeats or (1 if given.quick else 3)
     about = {"machine": machine.describe(core), "repeats": repeats, "arch": open_engine().arch, "quick": given.quick}
-
-    variants = discover()
-    kept_folder = os.environ.get("MPMBENCH_CACHE_DIR")
-    try:
-        for (
-            mode
-        ) in MODES:  # imports, the NVRTC library and LLVM's tables are loaded once, by a kernel that is not timed
-            compile_times(variants[0], mode, repeats=1)
-        compiles = [compile_times(variant, mode, repeats) for variant in variants for mode in MODES]
-    finally:
-        if kept_folder is None:
-            os.environ.pop("MPMBENCH_CACHE_DIR", None)
-        else:
-            os.environ["MPMBENCH_CACHE_DIR"] = kept_folder
-    counts = count_times(COUNTED, given.particles or (QUICK_PARTICLES if given.quick else PARTICLES), repeats)
+    with CpuDevice().undisturbed():
+        compiles = all_compile_times(repeats)
+        counts = count_times(COUNTED, given.particles or (QUICK_PARTICLES if given.quick else PARTICLES), repeats)
 
     text = markdown(compiles, counts, about)
     given.out.mkdir(parents=True, exist_ok=True)

@@ -6,12 +6,15 @@ import ctypes
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
-from scenes import PeerMissing, Scene
 
-NAME = "g++"
+from mpmbench.grid import Grid
+from mpmbench.peers import Library, PeerMissing
+
 FLAGS = ("-O3", "-march=native")
 SOURCE = Path(__file__).with_name("transfer.cpp")
 
@@ -23,10 +26,10 @@ class _Domain(ctypes.Structure):
     )  # fmt: skip
 
 
-class Peer:
+class Transfers:
     """Compiles once; PeerMissing where there is no g++ or it fails."""
 
-    name = NAME
+    facts: ClassVar[Mapping[str, Any]] = {"fast_math": False, "threads": 1}
 
     def __init__(self) -> None:
         compiler = shutil.which("g++")
@@ -45,24 +48,25 @@ class Peer:
             # The loader keeps the mapping, so the file may go.
             self._library = ctypes.CDLL(str(library))
 
-    def _launcher(self, function: str, scene: Scene, arrays: tuple[np.ndarray, ...]):
-        grid = scene.grid
+    def _launcher(self, function: str, grid: Grid, count: int, *arrays: np.ndarray) -> Callable[[], object]:
         domain = _Domain(grid.shape[0], grid.shape[1], *grid.origin, 1 / grid.dx)
         pointers = [ctypes.c_void_p(array.ctypes.data) for array in arrays]
         call = getattr(self._library, function)
         call.restype = None
-        count = ctypes.c_int(scene.count)
 
         def launch(_keep_alive: tuple[np.ndarray, ...] = arrays) -> None:
             # A ctypes pointer does not hold its array.
-            call(domain, count, *pointers)
+            call(domain, ctypes.c_int(count), *pointers)
 
         return launch
 
-    def p2g(self, scene: Scene, nodes: np.ndarray):
-        """A call that adds all particles into ``nodes`` (nodes, 4)."""
-        return self._launcher("p2g", scene, (scene.attributes, nodes))
+    def p2g(self, grid: Grid, count: int, particles: np.ndarray, nodes: np.ndarray) -> Callable[[], object]:
+        return self._launcher("p2g", grid, count, particles, nodes)
 
-    def g2p(self, scene: Scene, nodes: np.ndarray, results: np.ndarray):
-        """A call that gathers ``nodes`` (nodes, 4) into ``results`` (n, 4)."""
-        return self._launcher("g2p", scene, (scene.attributes, nodes, results))
+    def g2p(
+        self, grid: Grid, count: int, particles: np.ndarray, velocities: np.ndarray, results: np.ndarray
+    ) -> Callable[[], object]:
+        return self._launcher("g2p", grid, count, particles, velocities, results)
+
+
+LIBRARY = Library("gcc", "g++", "", Transfers, SOURCE)

@@ -521,10 +521,15 @@ def verify(
     metavar="FILE.toml",
     help="Describe this machine's GPU for --gpu FILE.toml instead; an existing file is left alone.",
 )
-def doctor(gpu_path: Path | None) -> None:
+@click.option("--noise", is_flag=True, help="How often are equals called unequal here? Copies of one transfer, timed.")
+@click.option("--noise-seconds", type=click.FloatRange(min=1), metavar="N", help="How long --noise takes; default 30.")
+def doctor(gpu_path: Path | None, noise: bool, noise_seconds: float | None) -> None:
     """What is present, what is missing, and what to do about it."""
     from mpmbench.doctor import diagnose
 
+    if noise or noise_seconds is not None:
+        _noise(noise_seconds)
+        return
     if gpu_path is not None:
         from mpmbench.gpu.write import write_gpu
 
@@ -539,6 +544,16 @@ def doctor(gpu_path: Path | None) -> None:
         console.print(item.detail, markup=False, soft_wrap=True)
         if item.remedy and item.status != "ok":
             console.print(f"        -> {item.remedy}", markup=False, soft_wrap=True)
+
+
+def _noise(seconds: float | None) -> None:
+    from mpmbench.noise import SECONDS, describe, measure_noise
+
+    (device,) = _open_devices(["cuda" if _gpu_present() else "cpu"], None, "run")
+    with _progress() as progress:
+        found = measure_noise(device, seconds or SECONDS, _step_by_step(progress))
+    for line in describe(found, device):
+        console.print(line, markup=False, soft_wrap=True)
 
 
 @main.command()

@@ -7,8 +7,10 @@ Each module of this package holds one ``LIBRARY``; a ``Peer`` is one transfer of
 from __future__ import annotations
 
 import importlib
+import os
 import pkgutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata
@@ -112,12 +114,26 @@ def open_library(library: Library) -> Transfers:
     if not library.installed:
         raise PeerMissing(f"{library.title} is not installed: {INSTALL}")
     try:
-        return library.open()
+        with _silenced():
+            return library.open()
     except PeerMissing:
         raise
     except Exception as error:  # a broken installation of somebody else's library is a row with a reason
         text = " ".join(str(error).split())[:200]
         raise PeerMissing(f"{library.title} does not start ({type(error).__name__}: {text}): {INSTALL}") from error
+
+
+@contextmanager
+def _silenced() -> Iterator[None]:
+    """Libraries greet on standard output, and one warns from C++ that there is no GPU: our output is for rows."""
+    kept = os.dup(2)
+    with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):
+        os.dup2(nowhere.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
 
 
 def discover() -> tuple[Peer, ...]:
