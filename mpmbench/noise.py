@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
@@ -27,7 +27,7 @@ COPIES = 4  # beside the baseline and its own copy
 VARIANT = "g2p_global_gather"  # nothing but reads: every run does the same
 # device -> particles and cache state. A GPU needs times well above the resolution of its events; on a processor,
 # overwriting the caches takes longer than all the rest.
-TRANSFERS = {"cuda": (500_000, "cold"), "cpu": (5_000, "hot")}
+TRANSFERS = {"cuda": (500_000, "cold"), "cpu": (1_000, "hot")}
 REMEDIES = {
     "cuda": "use the GPU alone, lock its clocks (`mpmbench doctor` says how), or time with --rigorous",
     "cpu": "stop other programs, keep a core free for this one, or time with --rigorous",
@@ -38,9 +38,9 @@ REMEDIES = {
 class Noise:
     """What came of the trials.
 
-    seconds: that the trials took.  copies: verdicts on identical arms that were reached.  false: of them FAST or SLOW.  unusable: copies without a
-    verdict, because their samples had to be thrown away.  spreads: per trial, how far the interval of the ratio of two
-    copies reaches from 1.  discarded: passes thrown away, by reason.
+    rounds: of each trial.  seconds: that all took.  copies: verdicts on identical arms that were reached.  false: of them
+    FAST or SLOW.  unusable: copies without a verdict, because their samples had to be thrown away.  spreads: per trial,
+    how far the interval of the ratio of two copies reaches from 1.  discarded: passes thrown away, by reason.
     """
 
     rounds: int
@@ -75,7 +75,7 @@ def kind_of(device: Any) -> str:
 def measure_noise(
     device: Any, seconds: float = SECONDS, tick: Callable[[str, int, int], None] = lambda what, done, total: None
 ) -> Noise:
-    """Trials on a device that keeps time, for so many seconds and at least one trial. tick: (what, seconds done, of)."""
+    """Trials on a device that keeps time, for so many seconds, at least one. tick: (what, seconds done, of)."""
     particles, cache = TRANSFERS[kind_of(device)]
     with getattr(device, "undisturbed", nullcontext)():
         arm = _transfer(device, particles).arm(device)
