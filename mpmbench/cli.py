@@ -280,7 +280,7 @@ def list_command(variant_dirs: Sequence[Path], as_json: bool) -> None:
     for title, rows in (
         ("Variants", [(v.name, v.summary) for v in variants]),
         ("Primitives", [(p.name, p.summary) for p in blocks]),
-        ("Peers, on the device cpu", [(p.name, _with_cure(p)) for p in peers.discover()]),
+        ("Peers, on the device cpu", [(p.name, p.listed) for p in peers.discover()]),
         ("Datasets", [(d.name, d.summary) for d in list_datasets()]),
         ("Presets", [(name, (make.__doc__ or "").split("\n")[0]) for name, make in presets.PRESETS.items()]),
         ("Devices", [(d.name, d.summary) for d in list_devices()]),
@@ -309,12 +309,6 @@ def _print_axes(title: str, strategies: Sequence[tuple[str, Any]]) -> None:
         others = [f"{who}: {value}" for who, value in defaults.items() if value != usual]
         table.add_row(name, "  ".join(values), ", ".join(others))
     console.print(table)
-
-
-def _with_cure(peer: Any) -> str:
-    from mpmbench.peers import INSTALL
-
-    return peer.summary if peer.library.installed else f"{peer.summary}; not installed: {INSTALL}"
 
 
 def _axis_values(variant: Any) -> dict[str, list[Any]]:

@@ -38,9 +38,9 @@ REMEDIES = {
 class Noise:
     """What came of the trials.
 
-    rounds: of each trial.  seconds: that all took.  copies: verdicts on identical arms that were reached.  false: of them
-    FAST or SLOW.  unusable: copies without a verdict, because their samples had to be thrown away.  spreads: per trial,
-    how far the interval of the ratio of two copies reaches from 1.  discarded: passes thrown away, by reason.
+    rounds: of each trial.  seconds: that all took.  copies: verdicts on identical arms that were reached.  false: of
+    them FAST or SLOW.  unusable: copies without a verdict, because their samples had to be thrown away.  spreads: per
+    trial, how far the interval of the ratio of two copies reaches from 1.  discarded: passes thrown away, by reason.
     """
 
     rounds: int

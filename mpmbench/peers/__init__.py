@@ -96,6 +96,11 @@ class Peer:
         return f"{self.transfer.upper()} of {self.library.title} on one CPU thread"
 
     @property
+    def listed(self) -> str:
+        """The summary, and whether anything is missing for it."""
+        return self.summary + ("" if self.library.installed else " (not installed: extra peers)")
+
+    @property
     def axes(self) -> Mapping[str, tuple[Any, ...]]:
         return AXES
 
