@@ -58,6 +58,16 @@ def test_at_least_one_trial_and_each_ends_at_its_first_look():
     assert found.seconds == pytest.approx(samples * 1e-3, rel=0.2)
 
 
+def test_every_trial_has_an_order_of_its_own():
+    clock, taken = scripted(), []
+    sample = clock.sample
+    clock.sample = lambda arm: (taken.append(arm.name), sample(arm))[1]
+    found = trials(ARM, clock, seconds=1.0, rules=RULES)
+    of_a_trial = len(taken) // len(found.spreads)
+    orders = {tuple(taken[at : at + of_a_trial]) for at in range(0, len(taken), of_a_trial)}
+    assert len(orders) == len(found.spreads) > 2
+
+
 class Restless:
     """Throws away every third pass at first, and in the end all samples of one copy."""
 
