@@ -7,28 +7,40 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import pairwise
 
 from mpmbench.errors import InputError
-from mpmbench.measure import SHORTEST_RANKED, too_fast_to_rank
 from mpmbench.record import Record
-from mpmbench.report import banks, modelled, primitives, profile
+from mpmbench.report import (
+    answer,
+    banks,
+    density,
+    distributions,
+    measured,
+    modelled,
+    primitives,
+    profile,
+    searches,
+    winners,
+)
 from mpmbench.report import table as tables
-from mpmbench.report.banks import BankPicture
+from mpmbench.report.chart_data import Chart
+from mpmbench.report.doubts import doubts, throttled, throttled_action
 from mpmbench.report.modelled import GpuGroup
-from mpmbench.report.plots import Bars, Line, Lines, logspace, thin
+from mpmbench.report.plots import Bars, Line, Lines, thin
 from mpmbench.report.profile import Card
-from mpmbench.report.scatter import Scatter
 from mpmbench.report.table import Group, Kind, Table
-from mpmbench.report.text import number, seconds_text
+from mpmbench.report.text import number
 
-NOISY = 0.10  # interquartile range over median
+MOST_VALUES = 12  # of one fact about the environment
 NAMED = 5  # runs (or sentences) of one sort that are spelt out; the tables hold all
 
 KINDS = {
-    Kind.CHECKED: "compared with the float64 reference",
+    Kind.CHECKED: "compared with the float64 reference, or one run with another of the same",
     Kind.PREDICTED: "follows from sizes or from the compiler, known before anything runs",
     Kind.SIMULATED: "counted exactly while the CUDA kernel ran on the simulated device; not time",
     Kind.MEASURED: "event time on a GPU",
+    Kind.WALL: "wall clock on a CPU: comparable among themselves, and with no event time",
     Kind.MODELLED: "performance model of a named GPU, its caches and DRAM included; never measured",
     Kind.PUBLISHED: "printed in the source named, on its GPU",
 }
@@ -55,7 +67,7 @@ class Details:
 class Section:
     title: str
     tables: tuple[Table, ...] = ()
-    charts: tuple[Bars | Lines | BankPicture | Scatter, ...] = ()
+    charts: tuple[Chart, ...] = ()
     details: tuple[Details, ...] = ()
     intro: str = ""
     cards: tuple[Card, ...] = ()
@@ -78,12 +90,14 @@ class Document:
 class Extent:
     """How much a document holds.
 
+    searches: every configuration that a search tried.
     charts: how many groups get them; drawing takes time.  rows: of a table, the best ones.  groups: how many get a
     section, in the order run; the summary still has all.  cards: how many strategies get a profile of their own, of
     all GPUs together; the tables still have all.
     """
 
     hottest: bool = True
+    searches: bool = True
     steps: bool = True
     charts: int = 24
     rows: int | None = None
@@ -95,11 +109,13 @@ class Extent:
 EXTENTS = (
     Extent(),
     Extent(hottest=False),
-    Extent(hottest=False, steps=False, cards=12),
-    Extent(hottest=False, steps=False, charts=0, cards=6),
-    Extent(hottest=False, steps=False, charts=0, rows=200, groups=100, cards=0),
-    Extent(hottest=False, steps=False, charts=0, rows=40, groups=40, cards=0),
-    Extent(hottest=False, steps=False, charts=0, rows=10, groups=10, cards=0),
+    Extent(hottest=False, searches=False),
+    Extent(hottest=False, searches=False, steps=False, cards=12),
+    Extent(hottest=False, searches=False, steps=False, charts=6, cards=6),
+    Extent(hottest=False, searches=False, steps=False, charts=0, cards=6),
+    Extent(hottest=False, searches=False, steps=False, charts=0, rows=200, groups=100, cards=0),
+    Extent(hottest=False, searches=False, steps=False, charts=0, rows=40, groups=40, cards=0),
+    Extent(hottest=False, searches=False, steps=False, charts=0, rows=10, groups=10, cards=0),
 )
 
 
@@ -116,7 +132,13 @@ def build(records: Sequence[Record], extent: Extent = EXTENTS[0]) -> Document:
     profiles = _profiles(on_gpus[: extent.groups], extent)
     sections += profiles
     if any(g.ranked for g in groups):
-        sections.append(Section("Answer in one table", tuple(tables.summary(groups))))
+        counted = [g for g in groups if g.simulated and g.ranked]
+        shown = [*winners.tables_of(groups), *([tables.summary(counted)] if counted else [])]
+        sections.append(Section("Answer in one table", tuple(shown)))
+    if densities := density.charts(groups):
+        charts = tuple(chart for chart, _ in densities[: extent.charts])
+        shown = [table for _, table in densities]
+        sections.append(Section("Strategy against density", tuple(shown), charts, intro=density.EXPLANATION))
     if published := tables.presets(records):
         sections.append(Section("Published tables, and the same rows here", tuple(published)))
     several_devices = len({g.device for g in groups}) > 1
@@ -141,7 +163,7 @@ def build(records: Sequence[Record], extent: Extent = EXTENTS[0]) -> Document:
             sections.append(Section(title, (_untitled(found), *more)))
     if extent.rows is not None:
         sections = [replace(s, tables=tuple(_shortened(t, extent.rows) for t in s.tables)) for s in sections]
-    parts = {"hottest lines": extent.hottest, "single steps": extent.steps}
+    parts = {"hottest lines": extent.hottest, "searches": extent.searches, "single steps": extent.steps}
     left_out = [name for name, shown in parts.items() if not shown]
     if extent.charts < len(groups):
         left_out.append(f"charts of {_plural(len(groups) - extent.charts, 'section')}")
@@ -155,7 +177,7 @@ def build(records: Sequence[Record], extent: Extent = EXTENTS[0]) -> Document:
         title="mpmbench report",
         verdict=verdict,
         agreed=agreed,
-        answer=tuple(_answer(groups, on_gpus, any(record.transfer_measurement for record in records))),
+        answer=tuple(_answer(groups, on_gpus, {tables.cost_kind(record) for record in records})),
         attention=tuple(_attention(records, groups)),
         sections=tuple(sections),
         legend=_legend(sections),
@@ -211,31 +233,24 @@ def _plural(count: int, one: str, many: str = "") -> str:
     return f"{count:,} {one if count == 1 else many or one + 's'}"
 
 
-def _answer(groups: Sequence[Group], on_gpus: Sequence[GpuGroup], measured: bool) -> list[str]:
+def _answer(groups: Sequence[Group], on_gpus: Sequence[GpuGroup], kinds: set[Kind]) -> list[str]:
     sentences = []
-    timed = [g for g in groups if not g.simulated and g.ranked]
+    timed = [g for g in groups if not g.simulated]
+    timed.sort(key=lambda g: g.kind is Kind.WALL)
     transfers = [g for g in on_gpus if g.group.first.is_transfer]
-    if not measured and on_gpus:
+    if kinds == {Kind.SIMULATED} and on_gpus:
         sentences.append(
             "No GPU took part: costs are counted on a simulated device, and every time below is modelled for the GPU "
             "that it names, with a range."
         )
-    elif not measured:
+    elif kinds == {Kind.SIMULATED}:
         sentences.append(
             "No GPU took part: every cost below is counted on a simulated device, exactly, and is not time. "
             "Run the same command where there is a GPU for times and speedups."
         )
-    for g in timed[:NAMED]:
-        best, base = g.ranked[0], g.baseline
-        assert best.transfer_measurement is not None
-        if too_fast_to_rank(best.transfer_measurement):
-            sentences.append(f"{g.title}, on {g.device}: too short to say which is fastest; use more particles.")
-            continue
-        words = f"{g.title}, on {g.device}: use {g.label(best)}, {seconds_text(best.transfer_measurement.median)}"
-        if base is not None and base is not best and base.transfer_measurement is not None:
-            gain = base.transfer_measurement.median / best.transfer_measurement.median
-            words += f", {number(gain)} times as fast as unsorted {base.variant} (transfer alone)"
-        sentences.append(f"{words}.")
+    elif Kind.MEASURED not in kinds:
+        sentences.append("No GPU took part: times are wall clock on a CPU, and say nothing about a GPU.")
+    sentences += [answer.sentence(g) for g in timed[:NAMED]]
     if len(timed) > NAMED:
         sentences.append(f"The table below has {_plural(len(timed) - NAMED, 'more measured case')}.")
     sentences += [modelled.answer(g) for g in transfers[:NAMED]]
@@ -276,6 +291,8 @@ def _attention(records: Sequence[Record], groups: Sequence[Group]) -> list[Atten
         elif r.status == "findings":
             action = "Its result cannot be relied on; the findings below name the lines."
             note("wrong", f"Refused, {tables.finding_text(r)}", action, where)
+        elif throttled(r):
+            note("warning", tables.reason(r), throttled_action(r), where)
         elif r.status == "broken":
             note("wrong", tables.reason(r), "It has no result and no rank.", where)
         elif r.status == "unchecked":
@@ -286,15 +303,10 @@ def _attention(records: Sequence[Record], groups: Sequence[Group]) -> list[Atten
             if info.get("spill_bytes"):
                 trouble = f"Kernel {kernel} spills {info['spill_bytes']} bytes of registers per thread to local memory"
                 note("warning", trouble, "A smaller block or less batching needs fewer registers.", where)
-        if (time := r.transfer_measurement) is not None:
-            if too_fast_to_rank(time):
-                trouble = f"Too short for the resolution of events (below {seconds_text(SHORTEST_RANKED)})"
-                note("warning", trouble, "Do not rank by it; use more particles.", where)
-            if time.noise > NOISY:
-                trouble = f"Samples scatter by more than {100 * NOISY:.0f} % (interquartile range over median)"
-                note("warning", trouble, "Lock the clocks, free the GPU, and run again.", where)
+    for doubt in doubts(groups):
+        note(doubt.level, doubt.trouble, doubt.action, doubt.where)
     for g in groups:
-        if g.ranked and g.baseline is None and len(g.ranked) > 1:
+        if g.ranked and g.baseline is None and len(g.ranked) > 1 and not g.paired:
             action = f"Add {tables.BASELINES.get(g.first.transfer)} with particle_order=given."
             note("note", "No break-even and no speedup, the baseline did not run", action, g.title)
     if any(r.environment.git_dirty for r in records):
@@ -352,18 +364,25 @@ def _profiles(groups: Sequence[GpuGroup], extent: Extent) -> list[Section]:
 
 def _group_section(g: Group, extent: Extent, charted: bool, name_device: bool) -> Section:
     details = []
-    shown = [tables.ranking(g)]
-    charts: list[Bars | Lines] = []
+    shown = [tables.ranking(g) if g.simulated else measured.ranking(g)]
+    charts: list[Chart] = []
     if len(g.ranked) > 1 and charted:
-        charts = _bars(g) + _break_even_lines(g)
+        charts += _bars(g) + _break_even_lines(g)
+    if not g.simulated and charted and (strips := distributions.chart(g)):
+        charts.insert(1, strips)
     if g.ranked:
         if g.simulated:
             shown.append(tables.counters(g))
+        if step := measured.whole_step(g):
+            shown.append(step)
         shown.append(tables.preprocessing(g))
     shown = [replace(t, title=t.title.replace(f". {g.title}", "").replace(f": {g.title}", "")) for t in shown]
     if extent.steps and (found := tables.steps(g)):
         found = [replace(t, title=t.title.replace(f": {g.title}", "")) for t in found]
         details.append(Details("Each step around the transfer on its own", tuple(found)))
+    if extent.searches and (tried := searches.found(g)):
+        searched = _plural(len(tried), "strategy was", "strategies were")
+        details.append(Details(f"How axes were chosen: {searched} searched, losers included", tuple(tried)))
     if extent.hottest and g.simulated:
         hottest = [t for r in g.ranked if (t := tables.hottest_lines(r, g.label(r)))]
         if hottest:
@@ -387,45 +406,64 @@ _BAR_MEASURES = (
 )
 
 
-def _bars(g: Group) -> list[Bars | Lines]:
+def _bars(g: Group) -> list[Chart]:
     if not g.simulated:
-        measures = (("Transfer time", "median transfer time [µs], measured", tables.seconds, 1e6),)
+        measures = (("Transfer time", f"median transfer time [µs], {_clock(g)}", tables.seconds, 1e6),)
     else:
         measures = tuple((*m, 1 / (tables.particles(g.first) or 1)) for m in _BAR_MEASURES)  # type: ignore[assignment]
-    charts: list[Bars | Lines] = []
+    charts: list[Chart] = []
     for title, axis, measure, scale in measures:
         costs = [(r, measure(tables.transfer_cost(r))) for r in g.ranked]
         known = sorted(((r, c * scale) for r, c in costs if c is not None), key=lambda pair: pair[1])
         if known:
             baseline = next((i for i, (r, _) in enumerate(known) if r is g.baseline), None)
             labels = tuple(g.label(r) + (" (baseline)" if r is g.baseline else "") for r, _ in known)
-            charts.append(Bars(title, axis, labels, tuple(c for _, c in known), baseline))
+            charts.append(Bars(title, axis, labels, tuple(c for _, c in known), baseline, g.kind))
     return charts
 
 
-def _break_even_lines(g: Group) -> list[Bars | Lines]:
+def _clock(g: Group) -> str:
+    return "wall clock" if g.kind is Kind.WALL else "measured"
+
+
+# 1 to 1000, every fourth a round number: those are told in the table of the curve.
+_ROUND = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+PER_SORT = (*(low * (high / low) ** (i / 4) for low, high in pairwise(_ROUND) for i in range(4)), 1000)
+
+
+def _break_even_lines(g: Group) -> list[Chart]:
     """Cost of a transfer with its share of the sort, over the number of transfers that share one sort."""
     if not g.simulated:
-        measures = (("time per transfer [µs], measured", tables.seconds, 1e6),)
+        measures = ((f"time per transfer [µs], {_clock(g)}; band: q1 to q3", tables.seconds, 1e6),)
     else:
         scale = 1 / (tables.particles(g.first) or 1)
         measures = (
             ("sectors per particle and transfer: simulated", tables.count_of(tables.sectors), scale),
             ("warp instructions per particle and transfer: simulated", tables.count_of(tables.warp_inst), scale),
         )  # type: ignore[assignment]
-    x = logspace(1, 1000, 40)
-    charts: list[Bars | Lines] = []
+    charts: list[Chart] = []
     for axis, measure, scale in measures:
         lines = []
         for r in g.ranked:
-            parts = tables.split(r, measure)
-            if parts is None or parts.per_transfer <= 0:
+            y = _over_transfers(r, measure, scale)
+            if y is None:
                 continue
-            y = tuple(scale * (parts.per_sort / k + parts.per_transfer) for k in x)
-            lines.append(Line(g.label(r), x, y, r is g.baseline))
+            band = None
+            if not g.simulated:
+                ends = [_over_transfers(r, measured.quartile(i), scale) for i in (0, 1)]
+                band = (ends[0], ends[1]) if ends[0] and ends[1] else None
+            lines.append(Line(g.label(r), PER_SORT, y, r is g.baseline, band))
         if len(lines) > 1:
-            charts.append(Lines("Transfer with its share of the sort", axis, "transfers per sort", thin(lines)))
+            title = "Transfer with its share of the sort"
+            charts.append(Lines(title, axis, "transfers per sort", thin(lines), g.kind))
     return charts
+
+
+def _over_transfers(record: Record, measure: tables.Measure, scale: float) -> tuple[float, ...] | None:
+    parts = tables.split(record, measure)
+    if parts is None or parts.per_transfer <= 0:
+        return None
+    return tuple(scale * (parts.per_sort / k + parts.per_transfer) for k in PER_SORT)
 
 
 # ---- legend and environment --------------------------------------------------------------------------------
@@ -471,4 +509,10 @@ def _environment(records: Sequence[Record]) -> tuple[tuple[str, str], ...]:
     if seconds:
         text = f"{sum(seconds):,.1f} s of wall clock for {_plural(len(seconds), 'run')}; says nothing about a GPU"
         facts["computing time here"] = {text: None}
-    return tuple((name, ", ".join(values)) for name, values in facts.items())
+    return tuple((name, _values(list(values))) for name, values in facts.items())
+
+
+def _values(values: list[str]) -> str:
+    """A fact that is another in every row (a temperature, say) is told by its first values."""
+    more = len(values) - MOST_VALUES
+    return f"{', '.join(values[:MOST_VALUES])}, and {more} more" if more > 0 else ", ".join(values)

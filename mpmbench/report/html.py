@@ -9,11 +9,10 @@ from typing import Any
 import jinja2
 from markupsafe import Markup, escape
 
-from mpmbench.report.banks import BankPicture
+from mpmbench.report import chart_data
+from mpmbench.report.chart_data import Chart
 from mpmbench.report.document import KINDS, Document
-from mpmbench.report.plots import Bars, Lines, svg
-from mpmbench.report.scatter import Scatter
-from mpmbench.report.speed_of_light import Roofline, SpeedOfLight
+from mpmbench.report.plots import svg
 from mpmbench.report.table import Column, Kind, Quantity, Table
 from mpmbench.report.text import LEFT, format_value
 
@@ -26,7 +25,7 @@ def render(document: Document) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"chart": _chart, "tight": _tight, "anchor": anchor, "code": _code}
+    environment.filters |= {"chart": _chart, "data": chart_data.data, "tight": _tight, "anchor": anchor, "code": _code}
     environment.globals |= {
         "header": _header,
         "rows": _rows,
@@ -41,7 +40,7 @@ def anchor(title: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
 
-def _chart(chart: Bars | Lines | BankPicture | Scatter | SpeedOfLight | Roofline) -> Markup:
+def _chart(chart: Chart) -> Markup:
     return Markup(svg(chart))
 
 
@@ -89,5 +88,6 @@ def _rows(table: Table) -> list[dict[str, Any]]:
                     "best": i in best[c],
                 }
             )
-        rows.append({"cells": cells, "status": row.status, "baseline": row.baseline})
+        tags = [*(["baseline"] if row.baseline else []), *([row.mark] if row.mark else [])]
+        rows.append({"cells": cells, "status": row.status, "baseline": row.baseline, "tags": tags})
     return rows

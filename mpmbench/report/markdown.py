@@ -62,10 +62,15 @@ def _table(table: Table) -> list[str]:
     best = [table.best(i) for i in range(len(table.columns))]
     rows = []
     for i, row in enumerate(table.rows):
-        cells = []
+        cells: list[str] = []
+        tags = [*(["(baseline)"] if row.baseline else []), *([f"**{row.mark}**"] if row.mark else [])]
         for c, (cell, column) in enumerate(zip(row.cells, table.columns, strict=True)):
             text = format_value(cell.value, column.quantity)
-            text = code(text) if column.quantity is Quantity.CODE else escape(text)
+            if column.quantity is Quantity.CODE:
+                text = " ".join([code(text), *tags])
+                tags = []  # beside the name, which is the first of these
+            else:
+                text = escape(text)
             cells.append(f"**{text}**" if i in best[c] and text else text)
         rows.append(cells)
     align = ["left" if column.quantity in LEFT else "right" for column in table.columns]

@@ -13,10 +13,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
+from mpmbench.report.table import Kind
 from mpmbench.report.text import number
 
 if TYPE_CHECKING:
     from mpmbench.report.banks import BankPicture
+    from mpmbench.report.distributions import Strips
     from mpmbench.report.scatter import Scatter
     from mpmbench.report.speed_of_light import Roofline, SpeedOfLight
 
@@ -41,28 +43,34 @@ class Bars:
     labels: tuple[str, ...]
     values: tuple[float, ...]
     highlight: int | None = None
+    kind: Kind = Kind.SIMULATED
 
 
 @dataclass(frozen=True)
 class Line:
+    """band: lower and upper ends around y, where they are known."""
+
     label: str
     x: tuple[float, ...]
     y: tuple[float, ...]
     baseline: bool = False
+    band: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
 
 @dataclass(frozen=True)
 class Lines:
-    """Curves over logarithmic axes."""
+    """Curves over logarithmic axes. marks: whether only the points are known, not what lies between."""
 
     title: str
     axis: str  # what the vertical axis shows
     x_axis: str
     lines: tuple[Line, ...]
+    kind: Kind = Kind.SIMULATED
+    marks: bool = False
 
 
 @lru_cache(maxsize=256)
-def svg(chart: Bars | Lines | BankPicture | Scatter | SpeedOfLight | Roofline) -> str:
+def svg(chart: Bars | Lines | BankPicture | Scatter | SpeedOfLight | Roofline | Strips) -> str:
     """An ``<svg>`` element. Kept, as a page that comes out too large is laid out again with less on it."""
     import matplotlib
 
@@ -86,8 +94,10 @@ def svg(chart: Bars | Lines | BankPicture | Scatter | SpeedOfLight | Roofline) -
             return _bars(chart)
         if isinstance(chart, Lines):
             return _lines(chart)
-        from mpmbench.report import banks, scatter, speed_of_light
+        from mpmbench.report import banks, distributions, scatter, speed_of_light
 
+        if isinstance(chart, distributions.Strips):
+            return distributions.draw(chart)
         if isinstance(chart, banks.BankPicture):
             return banks.draw(chart)
         if isinstance(chart, scatter.Scatter):
@@ -106,7 +116,7 @@ def _bars(chart: Bars) -> str:
         colour = MUTED if i == chart.highlight else SERIES[0]
         axes.barh(i, value, height=0.38, color=colour)
         # The name stands over its bar: beside it, there would be no room left on a narrow screen.
-        axes.text(0, i - 0.28, _fit(label), va="bottom", ha="left", fontsize=9)
+        axes.text(0, i - 0.28, fit(label), va="bottom", ha="left", fontsize=9)
         axes.text(value + 0.012 * top, i, number(value), va="center", ha="left", fontsize=9)
     axes.set_xlim(0, 1.14 * top)
     axes.set_ylim(len(values) - 0.6, -0.9)
@@ -125,12 +135,16 @@ def _lines(chart: Lines) -> str:
     axes = figure.add_axes((0.13, (legend_height + 0.5) / height, 0.83, (plot_height - 0.62) / height))
     series = 0
     for line in chart.lines:
+        colour = MUTED if line.baseline else SERIES[series % len(SERIES)]
+        if line.band:
+            axes.fill_between(line.x, *line.band, color=colour, alpha=0.2, linewidth=0)
+        mark: dict[str, Any] = {"marker": "o", "markersize": 3.5} if chart.marks else {}
         if line.baseline:
-            axes.plot(line.x, line.y, color=MUTED, linewidth=2.2, label=f"{_fit(line.label)} (baseline)")
+            axes.plot(line.x, line.y, color=colour, linewidth=2.2, label=f"{fit(line.label)} (baseline)", **mark)
         else:
             axes.plot(
-                line.x, line.y, color=SERIES[series % len(SERIES)], linewidth=1.6, label=_fit(line.label),
-                linestyle=DASHES[series % len(DASHES)],
+                line.x, line.y, color=colour, linewidth=1.6, label=fit(line.label),
+                linestyle=DASHES[series % len(DASHES)], **mark,
             )  # fmt: skip
             series += 1
     axes.set_xscale("log")
@@ -138,11 +152,11 @@ def _lines(chart: Lines) -> str:
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
         axis.set_minor_formatter(NullFormatter())
-    low, high = axes.get_ylim()
-    if high / low < 300:  # powers of ten alone would be too few to read a value off
-        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+        if high / low < 300:  # powers of ten alone would be too few to read a value off
+            axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high / low > 5 else (1, 1.5, 2, 3, 4, 5, 6, 8)))
     axes.grid(True, which="major")
-    axes.margins(x=0)
+    axes.margins(x=0.02 if chart.marks else 0)
     axes.set_xlabel(chart.x_axis)
     axes.legend(
         loc="upper left", bbox_to_anchor=(-0.02, -0.5 / (plot_height - 0.62)), frameon=False, fontsize=9,
@@ -151,8 +165,9 @@ def _lines(chart: Lines) -> str:
     return inline(figure, f"{chart.title}: {chart.axis}")
 
 
-def _fit(label: str) -> str:
-    return label if len(label) <= LONGEST_LABEL else f"{label[: LONGEST_LABEL - 1]}…"
+def fit(label: str, longest: int = LONGEST_LABEL) -> str:
+    """A label that fits in the width of a chart."""
+    return label if len(label) <= longest else f"{label[: longest - 1]}…"
 
 
 def inline(figure: object, label: str) -> str:

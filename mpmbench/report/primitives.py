@@ -3,27 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from mpmbench.record import Record
 from mpmbench.report import table as tables
+from mpmbench.report.contests import timed_apart
 from mpmbench.report.table import Column, Group, Kind, Quantity, Table
 from mpmbench.simt.counters import Tally
 
 
 def groups(records: Sequence[Record]) -> dict[str, list[Record]]:
-    """Records of primitives by the title of their section: operation, size and device, in the order run."""
-    found: dict[str, list[Record]] = {}
+    """Records of primitives by the title of their section: operation, size, device and caches, in the order run."""
+    alike: dict[str, list[Record]] = {}
     for record in records:
         if not record.is_transfer:
             where = Group((record,)).device
-            found.setdefault(f"{record.transfer.capitalize()} of {record.dataset.name}: {where}", []).append(record)
+            alike.setdefault(f"{record.transfer.capitalize()} of {record.dataset.name}: {where}", []).append(record)
+    found: dict[str, list[Record]] = {}
+    for title, runs in alike.items():
+        for part in timed_apart(runs):
+            caches = next((tables.cache_text(r.transfer_measurement.mode) for r in part if r.transfer_measurement), "")
+            found.setdefault(", ".join(filter(None, [title, caches])), []).extend(part)
     return found
 
 
 def table(records: Sequence[Record]) -> Table:
     """One row per strategy and choice of axes, in the order run; of equal rows the last counts."""
     latest = {(r.variant, tuple(sorted(r.axes.items(), key=str))): r for r in records}
-    return tables._table("", _SOURCES, list(latest.values()))
+    sources = [_of_kind(source, records[0]) for source in _SOURCES]
+    return tables._table("", sources, list(latest.values()))
+
+
+def _of_kind(source: tables._Source, record: Record) -> tables._Source:
+    """A column of times with the kind of the device that took them."""
+    if source.column.kind is not Kind.MEASURED or tables.cost_kind(record) is not Kind.WALL:
+        return source
+    return replace(source, column=replace(source.column, kind=Kind.WALL))
 
 
 def _counted(
@@ -56,7 +71,7 @@ _SOURCES = (
     tables._REMARK,
     tables._AGREEMENT,
     tables._Source(
-        Column("time", Kind.MEASURED, Quantity.SECONDS, "less", "median event time of all its launches"), _seconds
+        Column("time", Kind.MEASURED, Quantity.SECONDS, "less", "median time of all its launches"), _seconds
     ),
     tables._Source(
         Column("GB/s of the floor", Kind.MEASURED, Quantity.NUMBER, "more", "compulsory bytes over the time"),

@@ -15,8 +15,8 @@ from functools import cached_property
 from typing import Any
 
 from mpmbench.contest import BASELINES, PROBLEM_AXES
-from mpmbench.measure import too_fast_to_rank
-from mpmbench.record import PER_TRANSFER_STEPS, DatasetSummary, Record, StepCost, total_cost
+from mpmbench.record import PER_TRANSFER_STEPS, DatasetSummary, Record, StepCost
+from mpmbench.report.contests import timed_apart
 from mpmbench.simt.counters import SourceLine, Tally
 
 SECTOR_BYTES = 32
@@ -34,6 +34,7 @@ class Kind(StrEnum):
     PREDICTED = "predicted"  # follows from sizes alone, known before anything runs
     SIMULATED = "simulated"  # counted on the simulated device
     MEASURED = "measured"  # event time on a GPU
+    WALL = "wall clock"  # time of a run on the CPU; beside no event time
     MODELLED = "modelled"  # performance model of a named GPU
     PUBLISHED = "published"  # printed by somebody else
 
@@ -52,6 +53,7 @@ class Quantity(StrEnum):
     SECONDS = "seconds"
     SECONDS_RANGE = "seconds range"  # a pair (low, high)
     FACTOR = "factor"  # 2.0 is printed as a multiple
+    FACTOR_INTERVAL = "factor interval"  # (median, low, high)
     SHARE = "share"  # 0.5 is printed as a percentage
     RANK = "rank"
     TRANSFERS = "transfers"  # a break-even: 1 is "at once", infinity is "never"
@@ -66,7 +68,8 @@ class Cell:
 
 @dataclass(frozen=True)
 class Column:
-    """better: "less" or "more" where one end of the column is the good one, so that the best can be marked.
+    """better: "less" or "more" where one end of the column is the good one, so that the best can be marked; "leads"
+    where the rows that carry a mark are the best.
 
     under: adds to the column before it, and may be shown beneath it where width is scarce.
     """
@@ -84,6 +87,7 @@ class Row:
     cells: tuple[Cell, ...]
     status: str = "ok"  # Record.status; only "ok" rows can be best
     baseline: bool = False
+    mark: str = ""  # a word beside its name: "fastest", or "tied" where several share that
 
 
 @dataclass(frozen=True)
@@ -112,6 +116,8 @@ class Table:
             for i, row in enumerate(self.rows)
             if row.status == "ok" and row.cells[column].value is not None
         }
+        if better == "leads":
+            return {i for i in values if self.rows[i].mark} if len(values) > 1 else set()
         if better is None or len(set(values.values())) < 2:
             return set()
         target = min(values.values()) if better == "less" else max(values.values())
@@ -133,10 +139,12 @@ def _table(
     baseline: Record | None = None,
     notes: Iterable[str] = (),
     shared: Mapping[str, Any] | None = None,
+    mark: Callable[[Record], str] = lambda record: "",
 ) -> Table:
     """One row per record. Columns that no record can fill are left out.
 
     shared: axes that are said elsewhere; by default those that all rows share, which a note then names.
+    mark: see ``Row``.
     """
     notes = list(notes)
     if shared is None:
@@ -155,6 +163,7 @@ def _table(
             tuple(Cell(values[i], source.column.kind) for source, values in filled),
             record.status,
             record is baseline,
+            mark(record),
         )
         for i, record in enumerate(records)
     )
@@ -166,9 +175,14 @@ def _table(
 
 @dataclass(frozen=True)
 class Group:
-    """Runs that may be compared: one dataset, one transfer, one problem, one device. Ranked ones come first."""
+    """Runs that may be compared: one dataset, transfer, problem, device and state of the caches, and where they were
+    timed in paired rounds, the same rounds. Ranked ones come first, the leaders before all.
+
+    note: tells it from another group of the same name.
+    """
 
     records: tuple[Record, ...]
+    note: str = ""
 
     @property
     def first(self) -> Record:
@@ -178,16 +192,40 @@ class Group:
     def simulated(self) -> bool:
         return self.first.simulated
 
+    @property
+    def kind(self) -> Kind:
+        """Of its costs."""
+        return cost_kind(self.first)
+
     @cached_property
     def ranked(self) -> tuple[Record, ...]:
         return tuple(r for r in self.records if r.status == "ok" and _has_cost(r))
 
+    @property
+    def paired(self) -> bool:
+        """Whether its rows were compared round by round."""
+        return any(r.comparison for r in self.ranked)
+
+    @cached_property
+    def leaders(self) -> tuple[Record, ...]:
+        """Rows that no other was found to beat, the fastest first; none where nothing was paired."""
+        return tuple(r for r in self.ranked if r.comparison and r.comparison.leads)
+
     @cached_property
     def baseline(self) -> Record | None:
-        """The plainest run of unsorted global atomics (or gathers): fewest axes away from their defaults."""
-        name = BASELINES.get(self.first.transfer)
-        found = [r for r in self.ranked if r.variant == name and r.axes.get("particle_order") == "given"]
+        """What its rows were timed against; else the plainest run of unsorted global atomics (or gathers), with the
+        fewest axes away from their defaults."""
+        if self.paired:
+            return next((r for r in self.ranked if r.comparison and r.comparison.is_baseline), None)
+        found = [r for r in self.ranked if is_plain(r)]
         return min(found, key=lambda r: len(changed_axes(r)), default=None)
+
+    @property
+    def baseline_name(self) -> str | None:
+        """Of the baseline that was meant, whether it has a time or not."""
+        if self.baseline is not None:
+            return self.label(self.baseline)
+        return next((r.comparison.baseline for r in self.ranked if r.comparison), BASELINES.get(self.first.transfer))
 
     @cached_property
     def shared(self) -> dict[str, Any]:
@@ -198,29 +236,55 @@ class Group:
         return label(record, self.shared)
 
     @property
+    def caches(self) -> str:
+        """State of the caches before each sample, in words; "" where nothing was timed."""
+        time = self.first.transfer_measurement
+        return "" if time is None else cache_text(time.mode)
+
+    @property
     def title(self) -> str:
         record = self.first
-        words = [record.transfer.upper(), f"on {dataset_name(record.dataset)}", f"{record.dataset.n:,} particles"]
+        words = [f"{record.transfer.upper()} on {dataset_name(record.dataset)}", f"{record.dataset.n:,} particles"]
         words += [str(record.axes[axis]) for axis in PROBLEM_AXES if axis in record.axes]
-        return ", ".join([f"{words[0]} {words[1]}", *words[2:]])
+        return ", ".join(filter(None, [*words, self.caches, self.note]))
 
     @property
     def device(self) -> str:
         record = self.first
         if record.simulated:
             return f"simulated device, kernels compiled for {record.arch}"
+        if self.kind is Kind.WALL:
+            return f"{record.environment.cpu} (CPU, wall clock)"
         return f"{record.environment.gpu.get('name', record.device)}, {record.arch}"
+
+
+def cost_kind(record: Record) -> Kind:
+    """Of what a record's costs are: counts, event times, or wall clock."""
+    if record.simulated:
+        return Kind.SIMULATED
+    return Kind.WALL if record.device.startswith("cpu") else Kind.MEASURED
+
+
+def cache_text(mode: str) -> str:
+    return {"step": "caches as a step leaves them"}.get(mode, f"caches {mode}")
+
+
+def is_plain(record: Record) -> bool:
+    """Whether it is the transfer of somebody who has read nothing of this, on particles in the order given."""
+    return record.variant == BASELINES.get(record.transfer) and record.axes.get("particle_order") == "given"
 
 
 def group(records: Iterable[Record]) -> list[Group]:
     """Put together what may be compared. Of runs that are the same in every respect the last one counts."""
-    groups: dict[tuple[Any, ...], dict[tuple[Any, ...], Record]] = {}
+    alike: dict[tuple[Any, ...], list[Record]] = {}
     for r in records:
         problem = tuple(r.axes.get(axis) for axis in PROBLEM_AXES)
-        gpu = r.environment.gpu.get("name")
-        key = (r.dataset.name, r.dataset.fingerprint, r.transfer, problem, r.device, gpu, r.arch)
-        groups.setdefault(key, {})[(r.variant, tuple(sorted(r.axes.items(), key=str)))] = r
-    found = [Group(tuple(sorted(runs.values(), key=_order))) for runs in groups.values()]
+        processor = r.environment.cpu if cost_kind(r) is Kind.WALL else r.environment.gpu.get("name")
+        key = (r.dataset.name, r.dataset.fingerprint, r.transfer, problem, r.device, processor, r.arch)
+        alike.setdefault((*key, r.environment.gpu.get("uuid")), []).append(r)
+    found = _told_apart(
+        [Group(tuple(sorted(part, key=_order))) for runs in alike.values() for part in timed_apart(runs)]
+    )
     datasets = list(dict.fromkeys((g.first.dataset.name, g.first.dataset.fingerprint) for g in found))
     place = {dataset: i for i, dataset in enumerate(datasets)}
     # P2G and G2P of a dataset side by side, datasets in the order run.
@@ -233,12 +297,29 @@ def group(records: Iterable[Record]) -> list[Group]:
     )
 
 
+def _told_apart(groups: Sequence[Group]) -> list[Group]:
+    """With notes on those whose titles and devices read the same."""
+    alike: dict[tuple[str, str], list[Group]] = {}
+    for g in groups:
+        alike.setdefault((g.title, g.device), []).append(g)
+
+    def note(g: Group) -> str:
+        others = alike[g.title, g.device]
+        if len(others) == 1:
+            return ""
+        devices = [other.first.device for other in others]
+        return g.first.device if len(set(devices)) == len(others) else f"timing {others.index(g) + 1} of {len(others)}"
+
+    return [replace(g, note=note(g)) for g in groups]
+
+
 def _order(record: Record) -> tuple[Any, ...]:
     """Best first: by time where there is one, by sectors where counted; what cannot be ranked comes last."""
     if record.status != "ok" or not _has_cost(record):
         return (1, record.status, record.variant, str(record.axes))
     if record.transfer_measurement:
-        return (0, record.transfer_measurement.median, record.variant)
+        leads = record.comparison is not None and record.comparison.leads
+        return (0, not leads, record.transfer_measurement.median, record.variant)
     assert record.transfer_counters is not None
     return (0, record.transfer_counters.total.sectors, record.transfer_counters.total.warp_inst, record.variant)
 
@@ -392,7 +473,7 @@ def break_even(this: Split, baseline: Split) -> float:
     return max(1, math.floor(debt / gain) + 1)
 
 
-def _break_even(measure: Measure, baseline: Record | None) -> Callable[[Record], float | None]:
+def break_even_of(measure: Measure, baseline: Record | None) -> Callable[[Record], float | None]:
     def value(record: Record) -> float | None:
         if baseline is None or record is baseline or record.status != "ok":
             return None
@@ -524,10 +605,8 @@ WHY_RANKS_DISAGREE = (
 
 
 def ranking(g: Group) -> Table:
-    """Every run of the group, the ranked ones first; runs without a rank say why."""
+    """Every run of a simulated group, the ranked ones first; runs without a rank say why."""
     base = g.baseline
-    if not g.simulated:
-        return measured(g)
     sources = [
         _counted("rank by sectors", _rank(g.ranked, sectors), "1 moves the fewest sectors", Quantity.RANK, None),
         _counted(
@@ -541,20 +620,20 @@ def ranking(g: Group) -> Table:
         _WARP_INST,
         _counted(
             "break-even, sectors",
-            _break_even(count_of(sectors), base),
+            break_even_of(count_of(sectors), base),
             "transfers per sort from which preprocessing has paid for itself",
             Quantity.TRANSFERS,
         ),
         _counted(
             "break-even, warp inst",
-            _break_even(count_of(warp_inst), base),
+            break_even_of(count_of(warp_inst), base),
             "transfers per sort from which preprocessing has paid for itself",
             Quantity.TRANSFERS,
         ),
         _MEMORY,
     ]
     title = f"Ranking by sectors and by warp instructions: simulated, not time. {g.title}"
-    return _table(title, sources, g.records, base, (WHY_RANKS_DISAGREE, *_baseline_note(base, g)), g.shared)
+    return _table(title, sources, g.records, base, (WHY_RANKS_DISAGREE, *baseline_note(base, g)), g.shared)
 
 
 def counters(g: Group) -> Table:
@@ -575,7 +654,7 @@ def preprocessing(g: Group) -> Table:
         kind, quantity = Kind.SIMULATED, Quantity.NUMBER
         measures = (("sectors", count_of(sectors), True), ("warp inst", count_of(warp_inst), True))
     else:
-        kind, quantity = Kind.MEASURED, Quantity.SECONDS
+        kind, quantity = g.kind, Quantity.SECONDS
         measures = (("time", seconds, False),)
     for name, measure, per_particle in measures:
         unit = " / particle" if per_particle else ""
@@ -601,11 +680,11 @@ def preprocessing(g: Group) -> Table:
                     f"break-even, {name}", kind, Quantity.TRANSFERS, "less",
                     "transfers per sort from which preprocessing has paid for itself",
                 ),
-                _break_even(measure, base),
+                break_even_of(measure, base),
             )
         )  # fmt: skip
     return _table(
-        f"Preprocessing beside transfer: {g.title}", sources, g.ranked, base, _baseline_note(base, g), g.shared
+        f"Preprocessing beside transfer: {g.title}", sources, g.ranked, base, baseline_note(base, g), g.shared
     )
 
 
@@ -619,9 +698,12 @@ def _of_split(measure: Measure, pick: Callable[[Split], float], per_particle: bo
     return value
 
 
-def _baseline_note(base: Record | None, g: Group) -> tuple[str, ...]:
+def baseline_note(base: Record | None, g: Group) -> tuple[str, ...]:
     if base is not None:
-        return (f"Baseline of the break-even: {g.label(base)}, particles in the order given.",)
+        order = base.axes.get("particle_order")
+        return (f"Baseline: {g.label(base)}{', particles in the order given' if order == 'given' else ''}.",)
+    if g.paired:
+        return (f"No break-even: the baseline {g.baseline_name} has no time.",)
     name = BASELINES.get(g.first.transfer)
     return (f"No break-even: {name} with particle_order=given did not run on this dataset.",) if name else ()
 
@@ -639,7 +721,7 @@ def steps(g: Group) -> list[Table]:
             ("warp inst / particle", count_of(warp_inst), Kind.SIMULATED, Quantity.NUMBER, True),
         )
     else:
-        measures = (("time", seconds, Kind.MEASURED, Quantity.SECONDS, False),)
+        measures = (("time", seconds, g.kind, Quantity.SECONDS, False),)
     return [
         _table(
             f"Steps around the transfer, {title}: {g.title}",
@@ -664,53 +746,6 @@ def _of_step(name: str, measure: Measure, per_particle: bool) -> Callable[[Recor
         return None if number is None else number / (particles(record) or 1 if per_particle else 1)
 
     return value
-
-
-def measured(g: Group) -> Table:
-    """Event times of a GPU group."""
-    base = g.baseline
-    base_seconds = base and seconds(transfer_cost(base))
-
-    def timed(
-        title: str, value: Callable[[Record], Any], quantity: Quantity, better: str | None, explain: str
-    ) -> _Source:
-        return _Source(Column(title, Kind.MEASURED, quantity, better, explain), value)
-
-    def of_time(pick: Callable[[Record, float], float]) -> Callable[[Record], float | None]:
-        def value(record: Record) -> float | None:
-            time = seconds(transfer_cost(record))
-            return None if time is None or not time or not particles(record) else pick(record, time)
-
-        return value
-
-    def before(record: Record) -> float | None:
-        return seconds(total_cost(record.preprocess.values())) if record.preprocess else None
-
-    sources = [
-        _STRATEGY,
-        _AXES,
-        _REMARK,
-        _AGREEMENT,
-        timed("transfer", of_time(lambda r, t: t), Quantity.SECONDS, "less", "median event time of the transfer"),
-        timed(
-            "noise",
-            lambda r: r.transfer_measurement and r.transfer_measurement.noise,
-            Quantity.SHARE,
-            None,
-            "interquartile range over median",
-        ),
-        timed("ns / node visit", of_time(lambda r, t: 1e9 * t / r.node_visits), Quantity.NUMBER, "less",
-              "time per pair of particle and node in its support"),
-        timed("particles / s", of_time(lambda r, t: r.dataset.n / t), Quantity.RATE, "more", "throughput"),
-        timed("speedup", of_time(lambda r, t: (base_seconds or math.nan) / t) if base_seconds else lambda r: None,
-              Quantity.FACTOR, "more", "baseline's time over this one's, transfer alone"),
-        timed("preprocessing", before, Quantity.SECONDS, None, "median times of its steps, added up"),
-        timed("break-even", _break_even(seconds, base), Quantity.TRANSFERS, "less",
-              "transfers per sort from which preprocessing has paid for itself"),
-        _MEMORY,
-    ]  # fmt: skip
-    title = f"Ranking by measured time. {g.title}"
-    return _table(title, sources, g.records, base, _baseline_note(base, g), g.shared)
 
 
 def transfer_cost(record: Record) -> StepCost:
@@ -759,26 +794,16 @@ def hottest_lines(record: Record, name: str, count: int = HOTTEST_LINES) -> Tabl
 # ---- across groups -----------------------------------------------------------------------------------------
 
 
-def summary(groups: Sequence[Group]) -> list[Table]:
-    """One row per group: who wins, and by how much. Simulated and measured groups stand in tables of their own."""
-    tables = []
-    if timed := [g for g in groups if not g.simulated and g.ranked]:
-        tables.append(_summary_measured(timed))
-    if counted := [g for g in groups if g.simulated and g.ranked]:
-        tables.append(_summary(counted, (("sectors", sectors), ("warp instructions", warp_inst))))
-    return tables
-
-
 # What names a group stands around the winners: on a narrow screen only the first columns are in sight.
-_BEFORE = (Column("transfer", Kind.NAME, Quantity.TEXT), Column("dataset", Kind.NAME, Quantity.CODE))
-_AFTER = (Column("particles", Kind.NAME, Quantity.COUNT), Column("problem", Kind.NAME, Quantity.TEXT))
+BEFORE = (Column("transfer", Kind.NAME, Quantity.TEXT), Column("dataset", Kind.NAME, Quantity.CODE))
+AFTER = (Column("particles", Kind.NAME, Quantity.COUNT), Column("problem", Kind.NAME, Quantity.TEXT))
 
 
-def _before(g: Group) -> list[Any]:
+def before(g: Group) -> list[Any]:
     return [g.first.transfer.upper(), dataset_name(g.first.dataset)]
 
 
-def _after(g: Group) -> list[Any]:
+def after(g: Group) -> list[Any]:
     return [g.first.dataset.n, problem_text(g.first)]
 
 
@@ -786,71 +811,66 @@ def _row(values: Sequence[Any], columns: Sequence[Column], **options: Any) -> Ro
     return Row(tuple(Cell(v, c.kind) for v, c in zip(values, columns, strict=True)), **options)
 
 
-def _summary(groups: Sequence[Group], by: Sequence[tuple[str, Callable[[Tally], int]]]) -> Table:
-    columns = list(_BEFORE)
+def summary(groups: Sequence[Group]) -> Table:
+    """One row per simulated group: who wins, and by how much."""
+    by: tuple[tuple[str, Callable[[Tally], int]], ...] = (("sectors", sectors), ("warp instructions", warp_inst))
+    columns = list(BEFORE)
     for name, _ in by:
         columns += [
             Column(f"fewest {name}", Kind.SIMULATED, Quantity.CODE),
             Column(f"{name} / particle", Kind.SIMULATED, Quantity.NUMBER),
             Column(f"{name}, baseline / this", Kind.SIMULATED, Quantity.FACTOR),
         ]
-    columns += _AFTER
+    columns += AFTER
     several = len({g.first.arch for g in groups}) > 1
     columns += [Column("compiled for", Kind.NAME, Quantity.TEXT)] * several
     rows = []
     for g in groups:
-        values = _before(g)
+        values = before(g)
         for _, counter in by:
             best = min(g.ranked, key=lambda r: counter(r.transfer_counters.total))  # type: ignore[union-attr]
             count = counter(best.transfer_counters.total)  # type: ignore[union-attr]
             base = g.baseline and counter(g.baseline.transfer_counters.total)  # type: ignore[union-attr]
             values += [g.label(best), count / (particles(best) or 1), base / count if base and count else None]
-        rows.append(_row(values + _after(g) + [g.first.arch] * several, columns))
+        rows.append(_row(values + after(g) + [g.first.arch] * several, columns))
     return Table("Fewest sectors and fewest warp instructions: simulated, not time", tuple(columns), tuple(rows))
-
-
-def _summary_measured(groups: Sequence[Group]) -> Table:
-    columns = (
-        *_BEFORE,
-        Column("fastest", Kind.MEASURED, Quantity.CODE),
-        Column("transfer time", Kind.MEASURED, Quantity.SECONDS),
-        Column("speedup", Kind.MEASURED, Quantity.FACTOR),
-        Column("break-even", Kind.MEASURED, Quantity.TRANSFERS),
-        *_AFTER,
-        Column("device", Kind.NAME, Quantity.TEXT),
-    )
-    rows = []
-    for g in groups:
-        best, base = g.ranked[0], g.baseline
-        assert best.transfer_measurement is not None
-        if too_fast_to_rank(best.transfer_measurement):
-            continue
-        time = seconds(transfer_cost(best))
-        base_time = base and seconds(transfer_cost(base))
-        speedup = base_time / time if base_time and time else None
-        values = [g.label(best), time, speedup, _break_even(seconds, base)(best)]
-        rows.append(_row([*_before(g), *values, *_after(g), g.device], columns))
-    return Table("Fastest transfer, measured", columns, tuple(rows))
 
 
 def agreement(records: Sequence[Record]) -> Table:
     """Every variant against the float64 reference, over all its runs."""
-    columns = (
+    columns: tuple[Column, ...] = (
         Column("strategy", Kind.NAME, Quantity.CODE),
         Column("idea", Kind.NAME, Quantity.PROSE),
         Column("runs that agree", Kind.CHECKED, Quantity.COUNT),
         Column("runs checked", Kind.CHECKED, Quantity.COUNT),
         Column("worst error / allowance", Kind.CHECKED, Quantity.NUMBER),
-    )
+        Column(
+            "run to run", Kind.CHECKED, Quantity.PROSE,
+            explain="two runs on the same input, bit by bit; differences relative to the largest number of all",
+        ),
+    )  # fmt: skip
     rows = []
     for name in dict.fromkeys(r.variant for r in records):
         runs = [r for r in records if r.variant == name]
         checks = [r.check for r in runs if r.check is not None]
         passed = sum(c.passed for c in checks)
         worst = max((c.ratio for c in checks), default=None)
-        values = [name, runs[0].variant_summary, passed, len(checks), worst]
+        values = [name, runs[0].variant_summary, passed, len(checks), worst, repeat_text(runs)]
         rows.append(_row(values, columns, status="ok" if passed == len(checks) else "wrong"))
+    if not any(row.cells[-1].value for row in rows):  # nothing was run twice
+        columns, rows = columns[:-1], [replace(row, cells=row.cells[:-1]) for row in rows]
     return Table("Agreement with the float64 reference", columns, tuple(rows))
+
+
+def repeat_text(runs: Sequence[Record]) -> str:
+    """How two runs on the same input differ, of the run where they differ most."""
+    repeats = [r.repeat for r in runs if r.repeat is not None]
+    if not repeats:
+        return ""
+    worst = max(repeats, key=lambda repeat: (repeat.largest, repeat.differing))
+    if not worst.differing:
+        return f"the same bits in all {worst.of:,} numbers"
+    return f"{worst.differing:,} of {worst.of:,} numbers differ in bits, at most {worst.largest:.1e}"
 
 
 def skipped(records: Sequence[Record]) -> Table | None:
@@ -969,15 +989,23 @@ def distributions(records: Sequence[Record]) -> list[Table]:
 
 def presets(records: Sequence[Record]) -> list[Table]:
     """One table per published table: its printed numbers beside ours, in columns of their own."""
-    found: dict[tuple[str, Any, str], list[Record]] = {}
+    found: dict[tuple[str, Any, str, str], list[Record]] = {}
     for r in records:
         if r.preset_row:
-            found.setdefault((str(_preset(r, "source")), _preset(r, "table"), r.device), []).append(r)
+            modes = [r.transfer_measurement.mode] if r.transfer_measurement else _modes(records, r.device)
+            for mode in modes:
+                found.setdefault((str(_preset(r, "source")), _preset(r, "table"), r.device, mode), []).append(r)
     # Records come in the order run; tables and rows are wanted in the order printed.
     return [
         _published(sorted(rows, key=lambda r: _preset(r, "place") or 0))
-        for _, rows in sorted(found.items(), key=lambda item: (item[0][0], f"{item[0][1]!s:>9}", item[0][2]))
+        for _, rows in sorted(found.items(), key=lambda item: (item[0][0], f"{item[0][1]!s:>9}", *item[0][2:]))
     ]
+
+
+def _modes(records: Sequence[Record], device: str) -> list[str]:
+    """States of the caches in which published rows were timed on a device."""
+    times = [r.transfer_measurement for r in records if r.preset_row and r.device == device]
+    return list(dict.fromkeys(time.mode for time in times if time)) or [""]
 
 
 def _preset(record: Record, key: str) -> Any:
@@ -1023,6 +1051,8 @@ def _published(records: list[Record]) -> Table:
     def ours(title: str, kind: Kind, value: Callable[[Record], Any], quantity: Quantity, explain: str) -> _Source:
         return _Source(Column(title, kind, quantity, explain=explain), value)
 
+    # A simulated table has no times: these columns stay empty there and are left out.
+    time_kind = Kind.WALL if cost_kind(records[0]) is Kind.WALL else Kind.MEASURED
     several = len({r.dataset.fingerprint for r in records}) > 1
     where = _Source(Column("dataset", Kind.NAME, Quantity.CODE), lambda r: dataset_name(r.dataset) if several else "")
     row = _Source(Column("row as printed", Kind.NAME, Quantity.PROSE), lambda r: str(_preset(r, "row")))
@@ -1035,14 +1065,16 @@ def _published(records: list[Record]) -> Table:
              "sectors of the printed table's baseline over this row's; not a speedup"),
         ours("warp inst, baseline / this", Kind.SIMULATED, against(count_of(warp_inst)), Quantity.FACTOR,
              "warp instructions of the printed table's baseline over this row's; not a speedup"),
-        ours("transfer", Kind.MEASURED, lambda r: seconds(transfer_cost(r)), Quantity.SECONDS,
-             "median event time on this GPU"),
-        ours("speedup here", Kind.MEASURED, against(seconds), Quantity.FACTOR, "on this GPU"),
+        ours("transfer", time_kind, lambda r: seconds(transfer_cost(r)), Quantity.SECONDS, "median time here"),
+        ours("speedup here", time_kind, against(seconds), Quantity.FACTOR,
+             "time of the printed table's baseline over this row's, both measured here"),
         *(published(name.replace("_", " ").replace(" percent", " [%]"), _other_printed(name)) for name in others),
     ]  # fmt: skip
     errata = [f"{_preset(r, 'row')}: {erratum}" for r in records if (erratum := _preset(r, "erratum"))]
     source = str(_preset(records[0], "source") or "published").capitalize()
+    modes = dict.fromkeys(cache_text(r.transfer_measurement.mode) for r in records if r.transfer_measurement)
+    name = f"{records[0].transfer.upper()} on {records[0].dataset.name}"
     return _table(
-        f"{source}, table {_preset(records[0], 'table')}: {records[0].transfer.upper()} on {records[0].dataset.name}",
+        f"{source}, table {_preset(records[0], 'table')}: {', '.join([name, *modes])}",
         sources, records, None, [f"Erratum. {text}" for text in dict.fromkeys(errata)],
     )  # fmt: skip

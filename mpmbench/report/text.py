@@ -37,6 +37,8 @@ def format_value(value: Any, quantity: Quantity) -> str:
             return scaled(value, 1000, ("", " k", " M", " G", " T"))
         case Quantity.FACTOR:
             return f"{number(value)}×"
+        case Quantity.FACTOR_INTERVAL:
+            return interval_text(*value)
         case Quantity.SHARE:
             return f"{100 * value:.1f} %"
         case Quantity.TRANSFERS:
@@ -88,6 +90,17 @@ def range_text(low: float, high: float, words: Callable[[float], str]) -> str:
         return first
     (value, *unit), (_, *other) = first.split(), last.split()
     return f"{value} to {last}" if unit == other else f"{first} to {last}"
+
+
+def interval_text(median: float, low: float, high: float) -> str:
+    """A factor and its interval, to the digit that the interval knows."""
+    if not math.isfinite(median):
+        return MISSING
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return f"{number(median)}×, no interval"
+    half = (high - low) / 2
+    decimals = min(4, max(0, -math.floor(math.log10(half)))) if half > 0 else 2
+    return f"{median:,.{decimals}f}× [{low:,.{decimals}f}, {high:,.{decimals}f}]"
 
 
 def transfers_text(value: float) -> str:
