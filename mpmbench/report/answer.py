@@ -104,8 +104,9 @@ def _nothing_gained(g: Group, base: Record) -> str:
     compared = best.comparison
     interval = ""
     if compared is not None and compared.speedup is not None:
-        same = f", the same within {_percent(compared.margin)}" if compared.verdict == Verdict.SAME else ", not decided"
-        interval = f"; {best.variant}: {format_value(compared.speedup, Quantity.FACTOR_INTERVAL)}{same}"
+        same = f"the same within {_percent(compared.margin)}" if compared.verdict == Verdict.SAME else "not decided"
+        who = f"{g.label(best)}: " if len(others) > 1 else ""
+        interval = f" ({who}{format_value(compared.speedup, Quantity.FACTOR_INTERVAL)}, {same})"
     return f"nothing is faster for sure than {_over(base)}; {_list(g, others)} cannot be told apart from it{interval}"
 
 

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mpmbench.report.plots import INK, MUTED, RULE, SERIES, WIDTH, fit, inline
+from mpmbench.report.plots import INK, MUTED, RULE, SERIES, WIDTH, first_of, fit, inline
 from mpmbench.report.table import Cell, Column, Group, Kind, Quantity, Row, Table
 from mpmbench.report.text import number, seconds_text
 
 MOST_STRIPS = 20
 MOST_TICKS = 50  # per strip; more samples are drawn by as many of their quantiles
 ROW_HEIGHT = 0.5  # [inch]
-LONGEST_LABEL = 40
+LONGEST_LABEL = 50
 WIDEST = 4  # spreads of the typical strip; what lies further out is counted at the edge
 
 
@@ -53,6 +53,7 @@ def chart(g: Group) -> Strips | None:
         return None
     clock = "wall clock" if g.kind is Kind.WALL else "measured"
     axis = f"each sample over its strategy's median [%], {clock}; box: q1 to q3, line: 5 % to 95 %"
+    axis += first_of(len(strips), MOST_STRIPS)
     return Strips("Distribution of samples", axis, tuple(strips), g.kind)
 
 
@@ -76,6 +77,7 @@ def data(drawn: Strips) -> Table:
 def draw(drawn: Strips) -> str:
     """The plot as SVG."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     strips = drawn.strips[:MOST_STRIPS]
     low, high = (100 * end for end in limits(strips))
@@ -108,6 +110,8 @@ def draw(drawn: Strips) -> str:
     for side in ("left", "bottom"):
         axes.spines[side].set_visible(False)
     axes.set_yticks([])
+    # A number at the very edge would be cut off.
+    axes.set_xticks([x for x in MaxNLocator(6).tick_values(low, high) if 0.88 * low < x < 0.88 * high])
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:+g} %" if value else "median")
     axes.tick_params(length=0)
     axes.grid(True, axis="x")

@@ -27,7 +27,7 @@ from mpmbench.report import table as tables
 from mpmbench.report.chart_data import Chart
 from mpmbench.report.doubts import doubts, throttled, throttled_action
 from mpmbench.report.modelled import GpuGroup
-from mpmbench.report.plots import Bars, Line, Lines, thin
+from mpmbench.report.plots import MOST_BARS, Bars, Line, Lines, first_of, thin
 from mpmbench.report.profile import Card
 from mpmbench.report.table import Group, Kind, Table
 from mpmbench.report.text import number
@@ -202,25 +202,30 @@ def _untitled(table: Table) -> Table:
 
 
 def _verdict(records: Sequence[Record]) -> tuple[str, bool]:
-    ran = [r for r in records if r.status != "skipped"]
+    slowed = [r for r in records if throttled(r)]
+    ran = [r for r in records if r.status != "skipped" and not throttled(r)]
     wrong = [r for r in ran if r.status != "ok"]
+    lost = f" {_plural(len(slowed), 'run')} lost the time to a processor that slowed down." if slowed else ""
     strategies = _names(ran)
     sets = _plural(len({r.dataset.fingerprint for r in ran}), "dataset")
     if not ran:
-        return f"Nothing ran: {_plural(len(records), 'run')} skipped.", False
+        if skipped := len(records) - len(slowed):
+            return f"Nothing ran: {_plural(skipped, 'run')} skipped.{lost}", False
+        return f"Nothing was timed.{lost}", False
     if not wrong:
         worst = max(r.check.ratio for r in ran if r.check)
         every = "All" if len(strategies) > 1 else "The"
         return (
             f"{every} {_plural(len(strategies), 'strategy', 'strategies')} "
             f"agree{'' if len(strategies) > 1 else 's'} with the float64 reference "
-            f"({_plural(len(ran), 'run')} on {sets}, worst error {number(worst)} of the allowance).",
+            f"({_plural(len(ran), 'run')} on {sets}, worst error {number(worst)} of the allowance).{lost}",
             True,
         )
     bad = _names(wrong)
     return (
         f"{_plural(len(wrong), 'run')} of {len(ran)} cannot be trusted: "
-        f"{', '.join(bad[:6])}{' and more' if len(bad) > 6 else ''}. The others agree with the float64 reference.",
+        f"{', '.join(bad[:6])}{' and more' if len(bad) > 6 else ''}. "
+        f"{'The others agree with the float64 reference.' if len(wrong) < len(ran) else 'No other ran.'}{lost}",
         False,
     )
 
@@ -235,8 +240,7 @@ def _plural(count: int, one: str, many: str = "") -> str:
 
 def _answer(groups: Sequence[Group], on_gpus: Sequence[GpuGroup], kinds: set[Kind]) -> list[str]:
     sentences = []
-    timed = [g for g in groups if not g.simulated]
-    timed.sort(key=lambda g: g.kind is Kind.WALL)
+    timed = _in_turn([g for g in groups if not g.simulated])
     transfers = [g for g in on_gpus if g.group.first.is_transfer]
     if kinds == {Kind.SIMULATED} and on_gpus:
         sentences.append(
@@ -270,6 +274,18 @@ def _answer(groups: Sequence[Group], on_gpus: Sequence[GpuGroup], kinds: set[Kin
                 )
                 sentences.append(f"{transfer.upper()}, simulated, not time: fewest {name}: {who}.")
     return sentences
+
+
+def _in_turn(groups: Sequence[Group]) -> list[Group]:
+    """GPUs before CPUs; the first of each device, transfer and state of the caches before the second of any: those that
+    are spelt out shall not be one and the same."""
+    turns: dict[tuple[str, str, str, str], int] = {}
+    ordered = []
+    for g in groups:
+        alike = (g.device, g.first.device, g.first.transfer, g.caches)
+        ordered.append((turns.setdefault(alike, 0), g.kind is Kind.WALL, g))
+        turns[alike] += 1
+    return [g for _, _, g in sorted(ordered, key=lambda entry: entry[:2])]
 
 
 # ---- what needs attention ----------------------------------------------------------------------------------
@@ -418,6 +434,7 @@ def _bars(g: Group) -> list[Chart]:
         if known:
             baseline = next((i for i, (r, _) in enumerate(known) if r is g.baseline), None)
             labels = tuple(g.label(r) + (" (baseline)" if r is g.baseline else "") for r, _ in known)
+            axis += first_of(len(known), MOST_BARS)
             charts.append(Bars(title, axis, labels, tuple(c for _, c in known), baseline, g.kind))
     return charts
 

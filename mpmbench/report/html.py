@@ -76,12 +76,14 @@ def _rows(table: Table) -> list[dict[str, Any]]:
         for c, (cell, column) in enumerate(zip(row.cells, table.columns, strict=True)):
             text = format_value(cell.value, column.quantity)
             if column.under:
-                cells[-1]["under"] = "" if cell.value is None else text
+                cells[-1]["under"] += (
+                    [(text, column.quantity is Quantity.PROSE)] if text and cell.value is not None else []
+                )
                 continue
             cells.append(
                 {
                     "text": text,
-                    "under": "",
+                    "under": [],
                     "prose": column.quantity is Quantity.PROSE,
                     "code": column.quantity is Quantity.CODE,
                     "left": column.quantity in LEFT,

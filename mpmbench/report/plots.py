@@ -165,6 +165,11 @@ def _lines(chart: Lines) -> str:
     return inline(figure, f"{chart.title}: {chart.axis}")
 
 
+def first_of(count: int, most: int) -> str:
+    """For a chart that shows some of what it was given; its data has all."""
+    return f"; the first {most} of {count}" if count > most else ""
+
+
 def fit(label: str, longest: int = LONGEST_LABEL) -> str:
     """A label that fits in the width of a chart."""
     return label if len(label) <= longest else f"{label[: longest - 1]}…"

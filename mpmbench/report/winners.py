@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from mpmbench.protocol.verdict import geometric_mean
@@ -15,6 +16,7 @@ from mpmbench.report import table as tables
 from mpmbench.report.doubts import too_short
 from mpmbench.report.measured import TIED, mark
 from mpmbench.report.table import Column, Group, Kind, Quantity, Table
+from mpmbench.report.text import format_value
 
 NAMED_TIES = 3
 
@@ -39,10 +41,12 @@ def tables_of(groups: Sequence[Group]) -> list[Table]:
 def _winners(groups: Sequence[Group]) -> Table:
     kind = groups[0].kind
     processors = {(g.device, g.first.device) for g in groups}
-    where = [Column("device", Kind.NAME, Quantity.TEXT)]
+    several = len(processors) > 1
+    where = [Column("device", Kind.NAME, Quantity.CODE)]
     columns = (
-        *(where if len(processors) > 1 else []),
-        *tables.BEFORE,
+        # Several devices: what names the case stands beneath the device, so that the winner is in sight on a telephone.
+        *(where if several else []),
+        *(replace(column, under=several) for column in tables.BEFORE),
         Column("fastest", kind, Quantity.CODE),
         Column("cannot be told from it", kind, Quantity.CODE, under=True),
         Column("transfer time", kind, Quantity.SECONDS),
@@ -50,7 +54,7 @@ def _winners(groups: Sequence[Group]) -> Table:
         Column("verdict", kind, Quantity.TEXT, explain="of the fastest against the baseline"),
         Column("break-even", kind, Quantity.TRANSFERS),
         *tables.AFTER,
-        *(where if len(processors) == 1 else []),
+        *(where if not several else []),
     )
     rows = []
     for g in groups:
@@ -66,19 +70,17 @@ def _winners(groups: Sequence[Group]) -> Table:
             best.comparison.verdict if best.comparison and best is not base else "",
             tables.break_even_of(tables.seconds, base)(best),
         ]
-        around = [*(device if len(processors) > 1 else []), *tables.before(g), *values, *tables.after(g)]
-        rows.append(tables._row(around + (device if len(processors) == 1 else []), columns))
+        around = [*tables.before(g), *values, *tables.after(g)]
+        rows.append(tables._row([*device, *around] if several else [*around, *device], columns))
     unit = "wall clock on a CPU" if kind is Kind.WALL else "measured"
     caches = f", {groups[0].caches}" if groups[0].caches else ""
-    names = {"GPU" if kind is Kind.MEASURED else "CPU"}
-    title = f"Winner per {names.pop()} and dataset" if len(processors) > 1 else "Fastest transfer"
+    processor = "CPU" if kind is Kind.WALL else "GPU"
+    title = f"Winner per {processor} and dataset" if several else "Fastest transfer"
     return Table(f"{title}, {unit}{caches}", columns, tuple(rows))
 
 
 def speedup_text(g: Group, record: Record) -> str:
     """Over the baseline, with its interval where the two were paired."""
-    from mpmbench.report.text import format_value
-
     base = g.baseline
     if record.comparison is not None:
         return format_value(record.comparison.speedup, Quantity.FACTOR_INTERVAL) if record.comparison.speedup else ""
