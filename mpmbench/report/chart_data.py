@@ -52,7 +52,7 @@ def _lines(chart: Lines) -> Table:
     places = places[::step]
     columns = (
         Column("strategy", Kind.NAME, Quantity.CODE),
-        *(Column(f"{x:,.4g}", chart.kind, explain=f"{chart.axis} at {x:,.4g} {chart.x_axis}") for x in places),
+        *(Column(f"{x:,.10g}", chart.kind, explain=f"{chart.axis} at {x:,.10g} {chart.x_axis}") for x in places),
     )
     values = []
     baseline = None
@@ -61,7 +61,7 @@ def _lines(chart: Lines) -> Table:
         values.append((line.label, *(at.get(x) for x in places)))
         baseline = i if line.baseline else baseline
     table = _table(columns, values, baseline)
-    return Table("", table.columns, table.rows, (f"{chart.axis}, over {chart.x_axis}.",))
+    return Table("", table.columns, table.rows, (f"Columns: {chart.x_axis}. Numbers: {chart.axis}.",))
 
 
 def _roofline(chart: Roofline) -> Table:

@@ -16,9 +16,10 @@ from mpmbench.report.table import Cell, Column, Group, Kind, Quantity, Row, Tabl
 from mpmbench.report.text import number, seconds_text
 
 MOST_STRIPS = 20
-MOST_TICKS = 50  # per strip; more samples are drawn by as many of their quantiles
+MOST_TICKS = 40  # per strip; more samples are drawn by as many of their quantiles
 ROW_HEIGHT = 0.5  # [inch]
 LONGEST_LABEL = 50
+FENCE = 3  # interquartile ranges beyond the quartiles: Tukey's outer fence, beyond which are outliers
 WIDEST = 4  # spreads of the typical strip; what lies further out is counted at the edge
 
 
@@ -95,7 +96,7 @@ def draw(drawn: Strips) -> str:
         axes.plot((median, median), (i - 0.16, i + 0.16), color=INK, linewidth=1.4)
         ticks = values if len(values) <= MOST_TICKS else np.quantile(values, np.linspace(0, 1, MOST_TICKS))
         ticks = ticks[(ticks >= low) & (ticks <= high)]
-        x = np.repeat(ticks, 3)
+        x = np.repeat(ticks, 3)  # all ticks are one path, with gaps
         y = np.tile((i + 0.19, i + 0.31, np.nan), len(ticks))
         axes.plot(x, y, color=colour, linewidth=0.7)
         for outside, at, side in ((values < low, low, "left"), (values > high, high, "right")):
@@ -121,8 +122,9 @@ def draw(drawn: Strips) -> str:
 
 def limits(strips: Sequence[Strip]) -> tuple[float, float]:
     """What the axis shows, over the median: all but outliers, and not so much that the calm strips vanish."""
-    lows = [abs(float(np.quantile(strip.samples, 0.01))) for strip in strips]
-    highs = [float(np.quantile(strip.samples, 0.97)) for strip in strips]
+    quartiles = [np.quantile(strip.samples, (0.25, 0.75)).tolist() for strip in strips]
+    lows = [-max(strip.samples[0], q1 - FENCE * (q3 - q1)) for strip, (q1, q3) in zip(strips, quartiles, strict=True)]
+    highs = [min(strip.samples[-1], q3 + FENCE * (q3 - q1)) for strip, (q1, q3) in zip(strips, quartiles, strict=True)]
     low = min(max(lows), WIDEST * max(statistics.median(lows), 1e-4))
     high = min(max(highs), WIDEST * max(statistics.median(highs), 1e-4))
     least = max(low, high, 1e-4) / 4  # neither side so narrow that the median falls on the edge

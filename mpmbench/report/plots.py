@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -180,7 +181,10 @@ def inline(figure: object, label: str) -> str:
     from html import escape
 
     buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})  # type: ignore[attr-defined]
+    with warnings.catch_warnings():
+        # Text stays text and is set in the reader's font: that ours lacks a letter is of no matter.
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})  # type: ignore[attr-defined]
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
@@ -190,6 +194,8 @@ def inline(figure: object, label: str) -> str:
     text = re.sub(r' id="([^"]*)"', lambda m: m[0] if m[1] in used else "", text)
     text = re.sub(r"<!--.*?-->\s*", "", text, flags=re.DOTALL)
     text = re.sub(r"""font: ([\d.]+px) [^;"]*(?=[;"])""", r"font-size: \1", text)
+    text = re.sub(r"""\s*font-family: [^;"]*;?""", "", text)  # the page's
+    text = re.sub(r' transform="rotate\(-?0 [^"]*"', "", text)
     colours = {INK: "currentColor", RULE: "var(--rule)", MUTED: "var(--muted)"}
     colours |= {colour: f"var(--series-{i})" for i, colour in enumerate(SERIES)}
     for colour, variable in colours.items():
