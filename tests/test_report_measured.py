@@ -348,6 +348,13 @@ def test_a_whole_step_is_the_sum_of_its_parts():
     assert measured.whole_step(group(everyday())) is None
 
 
+def test_g2p_is_the_last_part_of_its_step():
+    around = {name: StepCost(None, steady(1e-4, "step")) for name in ("grid_clear", "p2g_global_atomic", "grid_divide")}
+    (record,) = contest([(row("g2p_global_gather"), 1e-3)], mode="step")
+    parts = measured.step_parts(replace(record, rest_of_step=around))
+    assert list(parts) == ["grid_clear", "p2g_global_atomic", "grid_divide", "g2p"]
+
+
 def test_a_search_shows_its_losers():
     record = search(row("p2g_block_sync"), 1e-3)
     (table,) = searches.found(Group((record,)))
@@ -558,6 +565,16 @@ def test_strategy_against_density():
     assert section.tables == (table,)
     assert "Strategy against density" in markdown_text(records)
     plots.svg(chart)
+
+
+def test_density_shows_the_fastest_of_several_choices_of_axes():
+    records = []
+    for d in (1, 4):
+        data = dataset("uniform_cube", per_cell=d)
+        slow = row("p2g_block_sync", dataset=data, axes={"batching": 4})
+        records += contest([(row("p2g_block_sync", dataset=data), 1e-3), (slow, 2e-3)], str(d))
+    ((_, table),) = density.charts(tables.group(records))
+    assert column(table, "4 per cell") == [pytest.approx(1e-9, rel=0.02)]
 
 
 def test_density_of_the_cells_that_hold_any_where_none_was_asked_for():
