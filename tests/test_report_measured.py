@@ -155,6 +155,7 @@ def test_another_baseline_is_not_called_plain():
 
 def test_a_baseline_that_failed():
     base, *others = everyday()
+    others = [judged(r, verdict="????", speedup=None, leads=False) for r in others]
     records = [failed(base.variant, dataset=base.dataset), *others]
     assert ", compared with nothing: the baseline p2g_global_atomic has no time" in said(records)
     (doubt,) = attention(records, "The baseline p2g_global_atomic has no time")
@@ -162,8 +163,16 @@ def test_a_baseline_that_failed():
     table = measured.ranking(group(records))
     assert not any(r.baseline for r in table.rows)
     assert "break-even" not in [c.title for c in table.columns]
-    assert "No break-even: the baseline p2g_global_atomic has no time." in table.notes
+    assert "No break-even: the baseline p2g_global_atomic has no row here." in table.notes
     assert "has no time" in html_text(records)
+
+
+def test_a_later_part_of_a_contest_was_timed_beside_a_baseline_without_a_row():
+    _, *others = everyday()
+    assert ", 1.42" in said(others)
+    assert " over the baseline (p2g_global_atomic); " not in said(others)  # without its row no break-even is known
+    assert said(others).endswith(" over the baseline (p2g_global_atomic).")
+    assert not attention(others, "nothing is compared")
 
 
 def test_one_arm_and_no_comparison():
@@ -232,6 +241,15 @@ def test_states_of_the_caches_are_never_in_one_table():
     assert len(doc.answer) == 2
     step = tables.group(everyday(mode="step"))[0]
     assert step.title.endswith("caches as a step leaves them")
+
+
+def test_a_run_without_a_time_stands_in_the_state_that_it_was_meant_for():
+    refused = failed("p2g_odd", "launch error", cache="hot")
+    groups = tables.group([*everyday(), *everyday(mode="hot", seed=2), refused])
+    assert [len(g.records) for g in groups] == [6, 7]
+    cold, hot = tables.group([*everyday(), refused])
+    assert (len(cold.records), hot.records, hot.caches) == (6, (refused,), "caches hot")
+    assert len(tables.group([refused, replace(refused, cache="cold")])) == 2
 
 
 def test_of_equal_runs_the_last_counts_whether_it_worked_or_not():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from mpmbench.protocol.verdict import Verdict
+from mpmbench.protocol.verdict import MARGIN, Verdict
 from mpmbench.record import PER_TRANSFER_STEPS, Record
 from mpmbench.report import table as tables
 from mpmbench.report.density import per_cell
@@ -80,14 +80,16 @@ def _over(base: Record) -> str:
 def _gain(g: Group, best: Record) -> str:
     """Its speedup, and in words where that is none for sure."""
     base, compared = g.baseline, best.comparison
-    if base is None:
+    if compared is None or (base is None and compared.speedup is None):
         return f", compared with nothing: the baseline {g.baseline_name} has no time"
-    if compared is None or compared.speedup is None:
+    if compared.speedup is None:
         return ""
-    text = f", {format_value(compared.speedup, Quantity.FACTOR_INTERVAL)} over {_over(base)}"
+    # A baseline that has no row here was timed beside these: they are a later part of a contest.
+    over = f"the baseline ({compared.baseline})" if base is None else _over(base)
+    text = f", {format_value(compared.speedup, Quantity.FACTOR_INTERVAL)} over {over}"
     match compared.verdict:
         case Verdict.SAME:
-            return f"{text}: the same within {_percent(compared.margin)}"
+            return f"{text}: the same within {_percent(MARGIN)}"
         case Verdict.AMBIGUOUS:
             return f"{text}: whether it is faster is not decided"
         case Verdict.UNUSABLE:
@@ -104,7 +106,7 @@ def _nothing_gained(g: Group, base: Record) -> str:
     compared = best.comparison
     interval = ""
     if compared is not None and compared.speedup is not None:
-        same = f"the same within {_percent(compared.margin)}" if compared.verdict == Verdict.SAME else "not decided"
+        same = f"the same within {_percent(MARGIN)}" if compared.verdict == Verdict.SAME else "not decided"
         who = f"{g.label(best)}: " if len(others) > 1 else ""
         interval = f" ({who}{format_value(compared.speedup, Quantity.FACTOR_INTERVAL)}, {same})"
     return f"nothing is faster for sure than {_over(base)}; {_list(g, others)} cannot be told apart from it{interval}"

@@ -14,7 +14,8 @@ from mpmbench.record import Record
 def timed_apart(records: Sequence[Record]) -> list[list[Record]]:
     """One list per state of the caches and contest, in the order run; of equal runs the last counts.
 
-    A run without a time belongs to no state: where there are several, it stands in each that has no time for it.
+    A run without a time stands in every contest of the state that it was meant for. Where that is not known and there
+    are several, it stands in each that has no time for it.
     """
     order = {id(record): place for place, record in enumerate(records)}
     latest = {(_mode(r), _identity(r)): r for r in records}
@@ -24,18 +25,25 @@ def timed_apart(records: Sequence[Record]) -> list[list[Record]]:
             contest = record.comparison.contest if record.comparison else ""
             parts.setdefault((_mode(record), contest), {})[_identity(record)] = record
     untimed = [record for record in latest.values() if not record.transfer_measurement]
-    if not parts:
-        return [untimed]
+    modes = {mode for mode, _ in parts}
+    strays: dict[str, list[Record]] = {}
     for record in untimed:
-        for part in parts.values():
+        if (meant := _mode(record)) and meant not in modes:
+            strays.setdefault(meant, []).append(record)
+            continue
+        for (mode, _), part in parts.items():
+            if meant and meant != mode:
+                continue
             other = part.get(_identity(record))
-            if other is None or (len(parts) == 1 and order[id(other)] < order[id(record)]):
+            if other is None or ((len(parts) == 1 or meant) and order[id(other)] < order[id(record)]):
                 part[_identity(record)] = record
-    return [list(part.values()) for part in parts.values()]
+    if not parts and "" in {_mode(record) for record in untimed}:
+        return [untimed]
+    return [*(list(part.values()) for part in parts.values()), *strays.values()]
 
 
 def _mode(record: Record) -> str:
-    return record.transfer_measurement.mode if record.transfer_measurement else ""
+    return record.transfer_measurement.mode if record.transfer_measurement else record.cache or ""
 
 
 def _identity(record: Record) -> tuple[Any, ...]:

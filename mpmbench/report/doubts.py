@@ -87,7 +87,7 @@ def _of_contest(g: Group) -> Iterator[Doubt]:
     if any(t.discarded for _, _, t in rows):
         # A pass is thrown away as a whole, so that every row of the contest carries the same numbers.
         yield _discarded(first, max((t for _, _, t in rows), key=lambda t: sum(t.discarded.values())), g.title)
-    if not any(c.is_baseline for _, c, _ in rows):
+    if not any(c.is_baseline or c.speedup for _, c, _ in rows):
         action = "Find out why it failed (its row says), then run again."
         yield Doubt("warning", f"The baseline {comparison.baseline} has no time: nothing is compared", action, g.title)
     floor = max(abs(comparison.noise[1] - 1), abs(comparison.noise[2] - 1))

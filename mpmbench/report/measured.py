@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+from mpmbench.protocol.verdict import MARGIN
 from mpmbench.record import PER_TRANSFER_STEPS, Record, StepCost, total_cost
 from mpmbench.report import table as tables
 from mpmbench.report.table import Column, Group, Kind, Quantity, Table
@@ -24,8 +25,8 @@ _REMARK_BELOW = replace(tables._REMARK, column=replace(tables._REMARK.column, un
 
 HOW_COMPARED = (
     "Speedup: the baseline's time over this row's, sample by sample from the same rounds; its median and its "
-    "{confidence:g} % interval. Verdicts: FAST and SLOW lie clear of ±{margin:.2g} %, SAME lies within, AMBG is not "
-    "decided, ???? cannot be compared. Rows that no other was found to beat share the mark."
+    "{confidence:g} % interval. Verdicts: FAST and SLOW lie clear of ±{margin:.2g} %, SAME lies within ±{same:.2g} %, "
+    "AMBG is not decided, ???? cannot be compared. Rows that no other was found to beat share the mark."
 )
 
 
@@ -123,7 +124,7 @@ def step_parts(record: Record) -> dict[str, StepCost]:
     if not record.rest_of_step:
         return {}
     before = {name: cost for name, cost in record.preprocess.items() if name in PER_TRANSFER_STEPS}
-    around = {**before, **record.rest_of_step}
+    around = {**record.rest_of_step, **{name: cost for name, cost in before.items() if name not in record.rest_of_step}}
     mine = {record.transfer: tables.transfer_cost(record)}
     if record.transfer == "g2p":  # the last part of a step, where P2G is the second
         return around | mine
@@ -163,7 +164,7 @@ def _how_compared(g: Group) -> list[str]:
     if not compared:
         return []
     widest = max((c.margin for c in compared if math.isfinite(c.margin)), default=0.0)
-    notes = [HOW_COMPARED.format(confidence=100 * compared[0].confidence, margin=100 * widest)]
+    notes = [HOW_COMPARED.format(confidence=100 * compared[0].confidence, margin=100 * widest, same=100 * MARGIN)]
     if all(map(math.isfinite, compared[0].noise)):
         low, high = (f"{100 * (end - 1):+.2f} %" for end in compared[0].noise[1:])
         notes.append(

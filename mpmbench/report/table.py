@@ -237,9 +237,10 @@ class Group:
 
     @property
     def caches(self) -> str:
-        """State of the caches before each sample, in words; "" where nothing was timed."""
+        """State of the caches before each sample, in words; "" where it is not known."""
         time = self.first.transfer_measurement
-        return "" if time is None else cache_text(time.mode)
+        mode = self.first.cache if time is None else time.mode
+        return cache_text(mode) if mode else ""
 
     @property
     def title(self) -> str:
@@ -703,7 +704,7 @@ def baseline_note(base: Record | None, g: Group) -> tuple[str, ...]:
         order = base.axes.get("particle_order")
         return (f"Baseline: {g.label(base)}{', particles in the order given' if order == 'given' else ''}.",)
     if g.paired:
-        return (f"No break-even: the baseline {g.baseline_name} has no time.",)
+        return (f"No break-even: the baseline {g.baseline_name} has no row here.",)
     name = BASELINES.get(g.first.transfer)
     return (f"No break-even: {name} with particle_order=given did not run on this dataset.",) if name else ()
 
@@ -992,7 +993,8 @@ def presets(records: Sequence[Record]) -> list[Table]:
     found: dict[tuple[str, Any, str, str], list[Record]] = {}
     for r in records:
         if r.preset_row:
-            modes = [r.transfer_measurement.mode] if r.transfer_measurement else _modes(records, r.device)
+            known = r.transfer_measurement.mode if r.transfer_measurement else r.cache
+            modes = [known] if known else _modes(records, r.device)
             for mode in modes:
                 found.setdefault((str(_preset(r, "source")), _preset(r, "table"), r.device, mode), []).append(r)
     # Records come in the order run; tables and rows are wanted in the order printed.
