@@ -40,7 +40,7 @@ KINDS = {
     Kind.PREDICTED: "follows from sizes or from the compiler, known before anything runs",
     Kind.SIMULATED: "counted exactly while the CUDA kernel ran on the simulated device; not time",
     Kind.MEASURED: "event time on a GPU",
-    Kind.WALL: "wall clock on a CPU: comparable among themselves, and with no event time",
+    Kind.WALL: "time of runs on a CPU: comparable among themselves, and with no event time",
     Kind.MODELLED: "performance model of a named GPU, its caches and DRAM included; never measured",
     Kind.PUBLISHED: "printed in the source named, on its GPU",
 }

@@ -99,7 +99,7 @@ def interval_text(median: float, low: float, high: float) -> str:
     if not (math.isfinite(low) and math.isfinite(high)):
         return f"{number(median)}×, no interval"
     half = (high - low) / 2
-    decimals = min(3, max(0, -math.floor(math.log10(half)))) if half > 0 else 2
+    decimals = min(3, max(2 if abs(median) < 10 else 0, -math.floor(math.log10(half)))) if half > 0 else 2
     return f"{median:,.{decimals}f}× [{low:,.{decimals}f}, {high:,.{decimals}f}]"
 
 
