@@ -97,11 +97,10 @@ def contests(cases: Iterable[Any], inputs: Any) -> list[list[Any]]:
 def baseline_of(cases: Sequence[Any], wanted: str = "") -> Any:
     """The case that the others are compared with: the one asked for, else the plainest, else the first."""
     if wanted:
-        found = [case for case in cases if f"{case.label} ".startswith(f"{wanted} ")] or [
-            case for case in cases if case.label.startswith(wanted)
-        ]
-        if found:
-            return found[0]
+        for fits in (str.__eq__, lambda label, name: f"{label} ".startswith(f"{name} "), str.startswith):
+            for case in cases:
+                if fits(case.label, wanted):
+                    return case
     plain = [case for case in cases if case.is_plain]
     return min(plain, key=lambda case: len(case.label), default=cases[0])
 
