@@ -1,18 +1,18 @@
 """Each strategy at its own best: block shape and batching searched within a budget of configurations.
 
-The search goes along one axis at a time, from the best found so far (coordinate descent), and begins with the defaults.
-Configurations that are tried together are a *heat*: on a device that keeps time they are strategies of one contest, so
-that drift hits all alike; for a GPU that is modelled they are runs on the simulated device. What is compared is the
-time of the transfer alone. A configuration whose result is wrong has no time and cannot be chosen.
+The budget goes to a spread over all that can exist, in which every value of every axis comes up about equally often,
+defaults first. Going along one axis after the other would need fewer, but stops too early: which batching is best
+depends on the block shape. On a device that keeps time the configurations of a strategy are timed in the same rounds,
+so that drift hits all alike; for a GPU that is modelled each runs on the simulated device. What is compared is the time
+of the transfer alone. A configuration whose result is wrong has no time and cannot be chosen.
 """
 
 from __future__ import annotations
 
 import itertools
-import random
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from mpmbench.contest import Timing, run_contest
@@ -21,15 +21,13 @@ from mpmbench.errors import InputError
 from mpmbench.gpu import Gpu
 from mpmbench.measure import Sampling
 from mpmbench.protocol import rounds
-from mpmbench.protocol.verdict import MARGIN, Verdict
+from mpmbench.protocol.verdict import MARGIN
 from mpmbench.record import Record, Tried, Tuning
 from mpmbench.runner import Case, Inputs, format_axis, label_of, refuse_bad_input, tuned_key
 from mpmbench.variants import Variant, why_impossible
 
-BUDGET = 12  # one of each value of both axes beside the defaults
-
-# Axes that change how a strategy works and neither what it computes nor which steps it needs, in the order searched.
-AXES = ("batching", "block_shape")
+# Axes that change how a strategy works and neither what it computes nor which steps it needs.
+AXES = ("block_shape", "batching")
 
 # Beside the shapes that a variant names: powers of two from 32 to 256 cells, long along x, in which cells are numbered.
 LONG_SHAPES = ((8, 2, 2), (8, 4, 2), (16, 4, 2), (16, 4, 4))
@@ -44,27 +42,23 @@ ONE_SAMPLE = Sampling(min_samples=1, max_samples=1, warmup_limit=0)
 class Search:
     """What of a case is free.
 
-    free: axes, in the order searched.  budget: configurations that may be tried.  configurations: all axes of each that
-    can exist, the one to begin with first.
+    free: axes.  budget: configurations that may be tried.  possible: how many can exist.
+    configurations: all axes of each that is tried; ties go to the first.
     """
 
     free: tuple[str, ...]
     budget: int
+    possible: int
     configurations: tuple[Mapping[str, Any], ...]
 
     @property
     def key(self) -> tuple[Any, ...]:
         """Searches of equal key find the same for the same case."""
-        return self.free, self.budget, len(self.configurations)
-
-    @property
-    def tries(self) -> int:
-        """Most configurations that are tried."""
-        return min(self.budget, len(self.configurations))
+        return self.free, self.budget, self.possible
 
     def __str__(self) -> str:
         free = f" of {', '.join(self.free)}" if self.free else ""
-        return f"{self.tries} of {len(self.configurations)} configurations{free}"
+        return f"{len(self.configurations)} of {self.possible} configurations{free}"
 
 
 def free_axes(variant: Variant, axes: Mapping[str, Any], fixed: Collection[str]) -> tuple[str, ...]:
@@ -76,9 +70,18 @@ def free_axes(variant: Variant, axes: Mapping[str, Any], fixed: Collection[str])
     )
 
 
-def values(variant: Variant, axis: str) -> tuple[Any, ...]:
-    """Candidates for an axis, the variant's default first."""
-    return tuple(dict.fromkeys([*variant.axes[axis], *(LONG_SHAPES if axis == "block_shape" else ())]))
+def spread(possible: Sequence[Mapping[str, Any]], free: Sequence[str], count: int) -> list[Mapping[str, Any]]:
+    """So many configurations, the first one first; each next one has the values that came up least until then."""
+    left = list(possible)
+    chosen = [left.pop(0)]
+    used = {name: Counter([chosen[0][name]]) for name in free}
+    while left and len(chosen) < count:
+        rarest = min(left, key=lambda axes: sum(used[name][axes[name]] for name in free))
+        left.remove(rarest)
+        chosen.append(rarest)
+        for name in free:
+            used[name][rarest[name]] += 1
+    return chosen
 
 
 def to_search(cases: Sequence[Any], budget: int, fixed: Collection[str]) -> list[Any]:
@@ -95,91 +98,44 @@ def to_search(cases: Sequence[Any], budget: int, fixed: Collection[str]) -> list
 
 
 def _to_search(case: Case, budget: int, fixed: Collection[str]) -> Case:
-    free = free_axes(case.variant, case.axes, fixed)
-    # The values of the case come first: with them the search begins.
-    choices = [dict.fromkeys([case.axes[name], *values(case.variant, name)]) for name in free]
-    every = [{**case.axes, **dict(zip(free, chosen, strict=True))} for chosen in itertools.product(*choices)]
-    possible = [axes for axes in every if not why_impossible(case.variant, axes)]
-    return replace(case, search=Search(free, budget, tuple(possible or every[:1])))
+    variant, free = case.variant, free_axes(case.variant, case.axes, fixed)
+    # Each axis begins with the case's own value, so that its own configuration comes first.
+    values = [
+        dict.fromkeys([case.axes[name], *variant.axes[name], *(LONG_SHAPES if name == "block_shape" else ())])
+        for name in free
+    ]
+    every = [{**case.axes, **dict(zip(free, chosen, strict=True))} for chosen in itertools.product(*values)]
+    possible = [axes for axes in every if not why_impossible(variant, axes)]
+    tried = spread(possible or every[:1], free, budget)  # where nothing can exist, the row says why
+    return replace(case, search=Search(free, budget, len(possible), tuple(tried)))
 
 
-# (cases, the best so far first) -> their records, in the same order.
-Heat = Callable[[Sequence[Case]], Sequence[Record]]
-
-
-def find(case: Case, heat: Heat, kind: str, gpu: str | None = None) -> tuple[Case, Record]:
-    """The case with the best axes found and with how they were found; the record of its last heat.
-
-    kind, gpu: of the times, as in ``Tuning``.
-    """
+def configurations(case: Case) -> list[Case]:
+    """A case for each configuration that its search tries."""
     assert case.search is not None
-    hunt = _Hunt(case, case.search, heat)
-    hunt.run()
-    tuning = Tuning(
-        case.search.free, case.search.budget, len(case.search.configurations), kind, gpu, tuple(hunt.tried())
+    return [replace(case, axes=axes, search=None) for axes in case.search.configurations]
+
+
+def choose(search: Search, records: Sequence[Record], kind: str, gpu: str | None = None) -> tuple[int, Tuning]:
+    """Place of the best record, one for each configuration in order, and the search as its row keeps it.
+
+    kind, gpu: of the times, as in ``Tuning``. The best is the fastest of those that are faster than the first that has
+    a time; if there is none, that first one.
+    """
+    timed = {place: time for place, record in enumerate(records) if (time := seconds(record)) is not None}
+    first = min(timed, default=0)
+    faster = [place for place in timed if place != first and _faster(records[place], records[first])]
+    best = min(faster, key=lambda place: timed[place], default=first)
+    order = sorted(range(len(records)), key=lambda place: (place != best, timed.get(place, float("inf")), place))
+    tried = tuple(
+        Tried(
+            {name: records[place].axes[name] for name in search.free},
+            timed.get(place),
+            "" if place in timed else _reason(records[place]),
+        )
+        for place in order
     )
-    return replace(hunt.best, tuning=tuning), replace(hunt.records[hunt.best.label], tuning=tuning)
-
-
-class _Hunt:
-    """One search under way. records: of each configuration, its last one."""
-
-    def __init__(self, case: Case, search: Search, heat: Heat) -> None:
-        self.search, self.heat = search, heat
-        self.open = [replace(case, axes=axes, search=None) for axes in search.configurations]
-        self.best = self.open[0]
-        self.records: dict[str, Record] = {}
-
-    def run(self) -> None:
-        if len(self.open) <= self.search.budget:
-            self.try_all(self.open)
-            return
-        idle = 0
-        for axis in itertools.cycle(self.search.free):
-            idle = 0 if self.try_all(self.along(axis)) else idle + 1
-            if idle == len(self.search.free):
-                break
-        # All axes have been gone through from the best: what is left of the budget goes to others, anywhere.
-        random.Random(0).shuffle(self.open)
-        self.try_all(self.open)
-
-    def along(self, axis: str) -> list[Case]:
-        """Configurations that differ from the best in one axis."""
-        others = [name for name in self.search.free if name != axis]
-        return [case for case in self.open if all(case.axes[name] == self.best.axes[name] for name in others)]
-
-    def try_all(self, cases: Sequence[Case]) -> bool:
-        """A heat of those that have not been tried and that the budget has room for; False where there are none."""
-        new = [case for case in (self.best, *cases) if case.label not in self.records]
-        new = list({case.label: case for case in new}.values())[: self.search.budget - len(self.records)]
-        if not new:
-            return False
-        together = [self.best, *(case for case in new if case.label != self.best.label)]
-        found = dict(zip((case.label for case in together), self.heat(together), strict=True))
-        self.records |= found
-        self.best = _best(together, found)
-        return True
-
-    def tried(self) -> Iterator[Tried]:
-        """The best, then the others by time, then what has none."""
-
-        def place(item: tuple[str, Record]) -> tuple[bool, float]:
-            time = seconds(item[1])
-            return item[0] != self.best.label, float("inf") if time is None else time
-
-        for _, record in sorted(self.records.items(), key=place):
-            axes = {name: record.axes[name] for name in self.search.free}
-            yield Tried(axes, seconds(record), "" if seconds(record) is not None else _reason(record))
-
-
-def _best(cases: Sequence[Case], records: Mapping[str, Record]) -> Case:
-    """The fastest of those that are faster than the first that has a time: ties go to it."""
-    timed = [case for case in cases if seconds(records[case.label]) is not None]
-    if not timed:
-        return cases[0]
-    base = records[timed[0].label]
-    faster = [case for case in timed[1:] if _faster(records[case.label], base)]
-    return min(faster, key=lambda case: seconds(records[case.label]) or 0.0, default=timed[0])
+    return best, Tuning(search.free, search.budget, search.possible, kind, gpu, tried)
 
 
 def seconds(record: Record) -> float | None:
@@ -192,11 +148,16 @@ def seconds(record: Record) -> float | None:
 
 
 def _faster(record: Record, base: Record) -> bool:
+    """By more than the margin: in rounds, pass by pass, that is at least what two copies of the baseline differ by."""
     compared = record.comparison
-    if compared and compared.baseline == label_of(base.variant, base.axes, base.default_axes):
-        return compared.verdict == Verdict.FAST
+    if compared and compared.speedup and compared.baseline == _label(base):
+        return compared.speedup[0] > 1 + compared.margin
     mine, its = seconds(record), seconds(base)
     return mine is not None and its is not None and mine * (1 + MARGIN) < its
+
+
+def _label(record: Record) -> str:
+    return label_of(record.variant, record.axes, record.default_axes)
 
 
 def _reason(record: Record) -> str:
@@ -222,22 +183,23 @@ def axes_text(axes: Mapping[str, Any]) -> str:
 def tune(
     case: Case, device: Any, inputs: Inputs, environment: Environment, timing: Timing, tick: Callable[[str], None]
 ) -> Case:
-    """The case with the axes that are fastest on this device, in this state of the caches. A heat is a short contest.
+    """The case with the axes that are fastest on this device in this state of the caches, found in a short contest.
 
     tick: told what is going on.
     """
-    count, tries = 0, _tries(case)
+    assert case.search is not None
+    cases = configurations(case)
+    short = replace(timing, rules=rounds.QUICK, sampling=ONE_SAMPLE, baseline=cases[0].label)
+    places = {one.title: place for place, one in enumerate(cases, start=1)}
 
-    def heat(cases: Sequence[Case]) -> list[Record]:
-        nonlocal count
-        count += len(cases) - bool(count)  # the best so far is there again
-        where = f"tuning {case.label} {count}/{tries}"
-        short = replace(timing, rules=rounds.QUICK, sampling=ONE_SAMPLE, baseline=cases[0].label)
-        records = run_contest(cases, device, inputs, environment, short, tick=lambda what: tick(f"{where}: {what}"))
-        found = {label_of(record.variant, record.axes, record.default_axes): record for record in records}
-        return [found[one.label] for one in cases]
+    def told(what: str) -> None:
+        place = places.get(what.removesuffix(": check"))
+        tick(f"tuning {case.name} {place}/{len(cases)}: check" if place else f"tuning {case.name}: {what}")
 
-    return find(case, heat, "measured (wall, CPU)" if device.name == "cpu" else "measured (events)")[0]
+    records = {_label(record): record for record in run_contest(cases, device, inputs, environment, short, tick=told)}
+    kind = "measured (wall, CPU)" if device.name == "cpu" else "measured (events)"
+    best, tuning = choose(case.search, [records[one.label] for one in cases], kind)
+    return replace(cases[best], tuning=tuning)
 
 
 def settled(case: Case, record: Record) -> Case:
@@ -257,58 +219,32 @@ def model_tuned(
 ) -> list[Record]:
     """``profile_cases`` with a search: each GPU has its own best axes, and so a record of its own per case.
 
-    progress: told of every configuration that runs.
+    progress: told of every configuration that runs. The record is that of the configuration that won: nothing is
+    counted twice.
     """
     from mpmbench.profile import Modeller, run_modelled
 
     refuse_bad_input(cases)
     environment, inputs = Environment.capture(), Inputs()
-    earlier = {(tuned_key(record), record.tuning.gpu): record for record in known if record.tuning}
-    groups = list(itertools.product(cases, gpus))
-    total = sum(_tries(case) for case, _ in groups)
+    earlier = {(tuned_key(record), gpu): record for record in known for gpu in record.modelled or ()}
+    groups = [(case, gpu, configurations(case) if case.search else [case]) for case in cases for gpu in gpus]
+    total, done = sum(len(tries) for *_, tries in groups), 0
     records: list[Record] = []
-    done = 0
-    for case, gpu in groups:
+    for case, gpu, tries in groups:
         model = Modeller(gpu)
-        heat = _Once(
-            run=partial(run_modelled, model=model, inputs=inputs, environment=environment),
-            tell=partial(_tell, progress, gpu.name, _tries(case), done, total),
-        )
-        found = earlier.get((case.resume_key(model.device(), inputs), gpu.name)) if earlier and case.search else None
+        found = earlier.get((case.resume_key(model.device(), inputs), gpu.name)) if earlier else None
         if found is None:
-            found = find(case, heat, "modelled", gpu.name)[1] if case.search else heat([case])[0]
+            tried = []
+            for place, one in enumerate(tries, start=1):
+                tuning = f"tuning {case.name} {place}/{len(tries)}: " if len(tries) > 1 else ""
+                progress(f"{gpu.name}: {tuning}{one.title}", done + place - 1, total)
+                tried.append(run_modelled(one, model, inputs, environment))
+            found = tried[0]
+            if case.search:
+                best, searched = choose(case.search, tried, "modelled", gpu.name)
+                found = replace(tried[best], tuning=searched)
             keep(found)
         records.append(found)
-        done += _tries(case)
+        done += len(tries)
     progress("done", total, total)
     return records
-
-
-def _tries(case: Any) -> int:
-    return case.search.tries if case.search else 1
-
-
-def _tell(
-    progress: Callable[[str, int, int], None], gpu: str, tries: int, done: int, total: int, case: Any, place: int
-) -> None:
-    tuning = f"tuning {case.name} {place + 1}/{tries}: " if tries > 1 else ""
-    progress(f"{gpu}: {tuning}{case.title}", done + place, total)
-
-
-@dataclass(frozen=True)
-class _Once:
-    """A heat on the simulated device: a case that has run before is not run again.
-
-    run: case -> its record.  tell: (case, how many have run) before each run.
-    """
-
-    run: Callable[[Any], Record]
-    tell: Callable[[Any, int], None]
-    records: dict[str, Record] = field(default_factory=dict)
-
-    def __call__(self, cases: Sequence[Any]) -> list[Record]:
-        for case in cases:
-            if case.label not in self.records:
-                self.tell(case, len(self.records))
-                self.records[case.label] = self.run(case)
-        return [self.records[case.label] for case in cases]
