@@ -280,10 +280,16 @@ class Times(dict):
         return super().get(f"{name} {self.threads}", super().get(name, default))
 
 
+@pytest.fixture(scope="module")
+def run() -> Any:
+    """Compiles each kernel once for all tests."""
+    return on_the_engine()
+
+
 @pytest.fixture
-def gpu(monkeypatch: pytest.MonkeyPatch) -> FakeGpu:
+def gpu(monkeypatch: pytest.MonkeyPatch, run: Any) -> FakeGpu:
     """A GPU on which a block of 4x4x4 (64 threads) is the faster one."""
-    run, times = on_the_engine(), Times({"p2g_block_sync 64": 0.002, "p2g_block_sync 128": 0.004})
+    times = Times({"p2g_block_sync 64": 0.002, "p2g_block_sync 128": 0.004})
 
     def execute(ptx: str, name: str, grid: Any, block: Any, arguments: Any, shared_bytes: int) -> None:
         run(ptx, name, grid, block, arguments, shared_bytes)
