@@ -1,10 +1,10 @@
 """Each strategy at its own best: block shape and batching searched within a budget of configurations.
 
 The budget goes to a spread over all that can exist, in which every value of every axis comes up about equally often,
-defaults first. Going along one axis after the other would need fewer, but stops too early: which batching is best
-depends on the block shape. On a device that keeps time the configurations of a strategy are timed in the same rounds,
-so that drift hits all alike; for a GPU that is modelled each runs on the simulated device. What is compared is the time
-of the transfer alone. A configuration whose result is wrong has no time and cannot be chosen.
+defaults first. Going along one axis after the other can get stuck, depending on which goes first: which batching is
+best depends on the block shape. On a device that keeps time the configurations of a strategy are timed in the same
+rounds, so that drift hits all alike; for a GPU that is modelled each runs on the simulated device. What is compared is
+the time of the transfer alone. A configuration whose result is wrong has no time and cannot be chosen.
 """
 
 from __future__ import annotations
@@ -203,8 +203,8 @@ def tune(
 
 
 def settled(case: Case, record: Record) -> Case:
-    """The case as an earlier search left it, from its row."""
-    return replace(case, axes=record.axes, search=None, tuning=record.tuning)
+    """The case with the axes that an earlier search found, from its row."""
+    return replace(case, axes=record.axes, search=None)
 
 
 # --- on named GPUs ----------------------------------------------------------------------------------------------------

@@ -22,6 +22,7 @@ from mpmbench.errors import InputError
 from mpmbench.gpu import get_gpu
 from mpmbench.protocol import rounds
 from mpmbench.record import Check, Comparison, Measurement, Record, Tried, from_json, read_records, to_json
+from mpmbench.report.modelled import gpu_groups
 from mpmbench.runner import Case, DatasetChoice
 from mpmbench.variants import resolve_axes, why_impossible
 
@@ -154,6 +155,15 @@ def test_a_wrong_result_is_recorded_and_never_chosen() -> None:
         assert all(one.seconds is None for one in found.tried[len(good) :]), "failures come last"
 
 
+def test_a_failure_is_recorded_and_never_chosen() -> None:
+    _, search = searched(2)
+    slow, broken = rows(search, 3e-3, 1e-3)
+    best, found = tuning.choose(search, [slow, replace(broken, failed_because="it broke")], "modelled", "gtx970")
+    assert best == 0
+    assert (found.tried[1].seconds, found.tried[1].reason) == (None, "broken: it broke")
+    assert not tuning.wrong(replace(slow, tuning=found))
+
+
 def test_a_record_with_a_search_survives_json() -> None:
     _, search = searched(3)
     records = rows(search, 2e-3, 1e-3, None)
@@ -233,6 +243,14 @@ def test_every_gpu_has_its_own_winner(made_up: list[Any]) -> None:
     assert told[2][0].startswith("gtx970: tuning p2g_block_sync 3/6")
     assert [done for _, done, _ in told] == list(range(13))
     assert {total for *_, total in told} == {12}
+
+
+def test_a_report_shows_every_gpu_with_what_was_tuned_for_it(made_up: list[Any]) -> None:
+    gpus = [get_gpu(name) for name in ("h100", "h200")]
+    found = tuning.model_tuned(tuning.to_search([case()], 2, ()), gpus, quiet)
+    assert found[0].arch == found[1].arch
+    assert found[0].axes == found[1].axes
+    assert [group.gpu for group in gpu_groups(found)] == ["h100", "h200"]
 
 
 def test_known_searches_are_not_repeated(made_up: list[Any]) -> None:

@@ -208,7 +208,8 @@ class Group:
     def device(self) -> str:
         record = self.first
         if record.simulated:
-            return f"simulated device, kernels compiled for {record.arch}"
+            tuned = f", axes searched for {record.tuning.gpu}" if record.tuning and record.tuning.gpu else ""
+            return f"simulated device, kernels compiled for {record.arch}{tuned}"
         return f"{record.environment.gpu.get('name', record.device)}, {record.arch}"
 
 
@@ -218,7 +219,8 @@ def group(records: Iterable[Record]) -> list[Group]:
     for r in records:
         problem = tuple(r.axes.get(axis) for axis in PROBLEM_AXES)
         gpu = r.environment.gpu.get("name")
-        key = (r.dataset.name, r.dataset.fingerprint, r.transfer, problem, r.device, gpu, r.arch)
+        tuned_for = r.tuning.gpu if r.tuning else None  # each GPU that is modelled has its own best axes
+        key = (r.dataset.name, r.dataset.fingerprint, r.transfer, problem, r.device, gpu, r.arch, tuned_for)
         groups.setdefault(key, {})[(r.variant, tuple(sorted(r.axes.items(), key=str)))] = r
     found = [Group(tuple(sorted(runs.values(), key=_order))) for runs in groups.values()]
     datasets = list(dict.fromkeys((g.first.dataset.name, g.first.dataset.fingerprint) for g in found))
