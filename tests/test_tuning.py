@@ -373,22 +373,23 @@ def test_a_wrong_configuration_is_told_and_loses(gpu: FakeGpu, tmp_path: Path) -
 
 
 def test_resume_keeps_what_was_tuned(gpu: FakeGpu, tmp_path: Path) -> None:
-    path = tmp_path / "rows.jsonl"
-    invoke(path, *BOTH)
+    path, words = tmp_path / "rows.jsonl", [*BOTH, "--baseline", "p2g_block_sync"]
+    invoke(path, *words)
     whole = path.read_bytes()
     gpu.calls.clear()
-    invoke(path, *BOTH, "--resume")
+    invoke(path, *words, "--resume")
     assert path.read_bytes() == whole
     assert not gpu.details("kernel")
-    first, second = whole.splitlines(keepends=True)
-    lost = [line for line in (first, second) if b'"variant":"p2g_global_atomic"' in line]
-    (left,) = [line for line in (first, second) if line not in lost]
+    (left,) = [line for line in whole.splitlines(keepends=True) if b'"variant":"p2g_block_sync"' in line]
     path.write_bytes(left)
     # The search of the row that is there is not repeated: it would find something else now.
     gpu.seconds["p2g_block_sync 64"] = 0.009
-    invoke(path, *BOTH, "--resume")
+    invoke(path, *words, "--resume")
     assert path.read_bytes().startswith(left)
-    assert [one.variant for one in read_records(path)] == ["p2g_block_sync", "p2g_global_atomic"]
+    kept, new = read_records(path)
+    assert (kept.variant, new.variant) == ("p2g_block_sync", "p2g_global_atomic")
+    assert new.comparison is not None
+    assert new.comparison.baseline == "p2g_block_sync block_shape=4x4x4 batching=2"
     invoke(path, *BOTH, "--resume", "-a", "batching=2")
     assert [one.variant for one in read_records(path)] == ["p2g_block_sync", "p2g_global_atomic", "p2g_block_sync"]
 
