@@ -97,10 +97,11 @@ def contests(cases: Iterable[Any], inputs: Any) -> list[list[Any]]:
 def baseline_of(cases: Sequence[Any], wanted: str = "") -> Any:
     """The case that the others are compared with: the one asked for, else the plainest, else the first."""
     if wanted:
-        for fits in (str.__eq__, lambda label, name: f"{label} ".startswith(f"{name} "), str.startswith):
-            for case in cases:
-                if fits(case.label, wanted):
-                    return case
+        found = [case for case in cases if f"{case.label} ".startswith(f"{wanted} ")] or [
+            case for case in cases if case.label.startswith(wanted)
+        ]
+        if found:
+            return found[0]
     plain = [case for case in cases if case.is_plain]
     return min(plain, key=lambda case: len(case.label), default=cases[0])
 
@@ -113,14 +114,15 @@ def run_contest(
     timing: Timing | None = None,
     known: Iterable[Any] = (),
     tick: Callable[[str], None] = lambda state: None,
+    baseline: Any = None,
 ) -> Iterator[Record]:
     """Records of cases that answer the same question, one by one as they are finished.
 
     known: those of the cases whose rows are there already; the baseline is timed again beside the missing ones, without
-    a row. tick: told what is going on.
+    a row. tick: told what is going on. baseline: one of the cases, where it is known; else ``baseline_of`` finds it.
     """
     timing = timing or Timing()
-    baseline = baseline_of(cases, timing.baseline)
+    baseline = baseline or baseline_of(cases, timing.baseline)
     silent = {id(case) for case in known}
     missing = [case for case in cases if id(case) not in silent]
     for number, batch in enumerate(_batches(missing, baseline, device, inputs)):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import replace
 from typing import Any
 
 from mpmbench.contest import Timing, baseline_of, contests, run_contest
@@ -86,11 +85,14 @@ def _contest(
         ready.append(known[-1] if record is not None else case)
     if len(known) == len(group):
         return
+
+    def named(what: str) -> None:
+        tick(f"{told} {what}")
+
     # The baseline is what was asked for, or the plainest, before its axes are searched for.
     baseline = ready.index(baseline_of(ready, timing.baseline))
     for place, case in enumerate(ready):
         if case.search:
-            ready[place] = tune(case, device, inputs, environment, timing, lambda what: tick(f"{told} {what}"))
-    timing = replace(timing, baseline=ready[baseline].label)
-    for record in run_contest(ready, device, inputs, environment, timing, known, lambda what: tick(f"{told} {what}")):
+            ready[place] = tune(case, device, inputs, environment, timing, named)
+    for record in run_contest(ready, device, inputs, environment, timing, known, named, ready[baseline]):
         yield record, True

@@ -189,14 +189,15 @@ def tune(
     """
     assert case.search is not None
     cases = configurations(case)
-    short = replace(timing, rules=rounds.QUICK, sampling=ONE_SAMPLE, baseline=cases[0].label)
+    short = replace(timing, rules=rounds.QUICK, sampling=ONE_SAMPLE)
     places = {one.title: place for place, one in enumerate(cases, start=1)}
 
     def told(what: str) -> None:
         place = places.get(what.removesuffix(": check"))
         tick(f"tuning {case.name} {place}/{len(cases)}: check" if place else f"tuning {case.name}: {what}")
 
-    records = {_label(record): record for record in run_contest(cases, device, inputs, environment, short, tick=told)}
+    rows = run_contest(cases, device, inputs, environment, short, tick=told, baseline=cases[0])
+    records = {_label(record): record for record in rows}
     kind = "measured (wall, CPU)" if device.name == "cpu" else "measured (events)"
     best, tuning = choose(case.search, [records[one.label] for one in cases], kind)
     return replace(cases[best], tuning=tuning)

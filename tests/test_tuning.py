@@ -17,7 +17,6 @@ from profiled import modelled_time, profile, record
 from mpmbench import measure, tuning, variants
 from mpmbench import profile as engine
 from mpmbench.cli import main
-from mpmbench.contest import baseline_of
 from mpmbench.errors import InputError
 from mpmbench.gpu import get_gpu
 from mpmbench.protocol import rounds
@@ -197,13 +196,6 @@ def test_rounds_pair_what_drifts() -> None:
     first, second = search.configurations
     found = [measured(first, 1.0e-3, None, 0.01), measured(second, 1.2e-3, 1.1, 0.01)]
     assert tuning.choose(search, found, "measured (events)")[0] == 1, "pass by pass it was faster"
-
-
-def test_a_baseline_is_found_by_its_whole_name_first() -> None:
-    other, plain = case(batching=2), case()
-    assert baseline_of([other, plain], "p2g_block_sync") is plain
-    assert baseline_of([plain, other], "p2g_block_sync batching=2") is other
-    assert baseline_of([other], "p2g_block") is other
 
 
 # --- named GPUs -------------------------------------------------------------------------------------------------------
