@@ -223,6 +223,29 @@ def _timings(caches: Sequence[str], quick: bool, rigorous: bool, baseline: str) 
     return [Timing(cache, rules, sampling, baseline) for cache in dict.fromkeys(caches)]
 
 
+def _to_search(cases: list[Any], budget: int, axes: Sequence[str], preset_name: str | None) -> list[Any]:
+    """The cases with a search for the axes that -a does not fix."""
+    from mpmbench.tuning import to_search
+
+    if preset_name is not None:
+        raise InputError("--preset fixes every axis: leave out --tune, or leave out --preset")
+    return to_search(cases, budget, {name for name, _ in map(_parse_axis, axes)})
+
+
+def _that_keep_time(devices: list[Any], named: bool) -> list[Any]:
+    """Devices to tune on; those that nobody has named may drop out."""
+    from mpmbench.session import keeps_time
+
+    timed = [device for device in devices if keeps_time(device)]
+    if not timed or (named and len(timed) < len(devices)):
+        raise InputError("--tune needs times: name a GPU to model with --gpu, or a device that keeps time with -d")
+    return timed
+
+
+def _searches(case: Any) -> str:
+    return f", tuning: {case.search}" if case.search else ""
+
+
 def _refuse_unknown_baseline(cases: Sequence[Any], baseline: str) -> None:
     if baseline and not any(case.label.startswith(baseline) for case in cases):
         labels = ", ".join(dict.fromkeys(case.label for case in cases))
@@ -334,6 +357,14 @@ def _axis_values(variant: Any) -> dict[str, list[Any]]:
 )
 @click.option("--rigorous", is_flag=True, help="More and longer rounds: finer differences are told apart.")
 @click.option(
+    "--tune",
+    type=click.IntRange(min=1),
+    is_flag=False,
+    flag_value=12,
+    metavar="[N]",
+    help="Each strategy at its best block_shape and batching of N tried (12 if N is left out); -a fixes an axis.",
+)
+@click.option(
     "--baseline",
     default="",
     metavar="NAME",
@@ -351,6 +382,7 @@ def run(
     nvbench_path: Path | None,
     gpu_names: Sequence[str],
     rigorous: bool,
+    tune: int | None,
     baseline: str,
     shard: str | None,
     resume: bool,
@@ -376,11 +408,15 @@ def run(
         raise InputError("--resume needs --json FILE, the file whose rows it keeps")
     outputs = [json_path, html_path, md_path, csv_path, nvbench_path]
     _refuse_targets(outputs, selection["datasets"])
+    if tune is not None:
+        cases = _to_search(cases, tune, selection["axes"], preset_name)
     if gpu_names:
         _run_modelled(cases, gpu_names, devices, arch, outputs, resume, dry_run)
         return
     # The thesis measured a GTX 970: its rows are counted on the code that NVRTC makes for that GPU.
     opened = _open_devices(devices, arch or ("sm_52" if preset_name == "thesis" else None), "count")
+    if tune is not None:
+        opened = _that_keep_time(opened, named=bool(devices))
     if shard is not None:
         from mpmbench.session import keeps_time
         from mpmbench.session import shard as part
@@ -389,7 +425,9 @@ def run(
     if dry_run:
         for device in opened:
             for case in cases:
-                console.print(f"{device.name} {device.arch}  {case.title}", markup=False, soft_wrap=True)
+                console.print(
+                    f"{device.name} {device.arch}  {case.title}{_searches(case)}", markup=False, soft_wrap=True
+                )
         console.print(f"{len(cases) * len(opened)} rows")
         return
     timings = _timings(caches, quick, rigorous, baseline)
@@ -582,7 +620,8 @@ def _run_modelled(
     gpus = cli_profile.parse_gpus(gpu_names)
     if dry_run:
         for case in cases:
-            console.print(f"{', '.join(gpu.name for gpu in gpus)}  {case.title}", markup=False, soft_wrap=True)
+            names = ", ".join(gpu.name for gpu in gpus)
+            console.print(f"{names}  {case.title}{_searches(case)}", markup=False, soft_wrap=True)
         console.print(f"{len(cases)} cases on {len(gpus)} GPUs")
         return
     json_path, *reports = outputs
@@ -704,10 +743,15 @@ def _write_reports(
 def _summarise(records: list[Any], written: Sequence[Path]) -> None:
     """The problems, the report's own answer, the files; exit code 4 where a result is wrong."""
     from mpmbench.report import document
+    from mpmbench.tuning import axes_text, wrong
 
     by_status: dict[str, int] = {}
     for record in records:
         by_status[record.status] = by_status.get(record.status, 0) + 1
+    mistuned = [(record, one) for record in records for one in wrong(record)]
+    for record, one in mistuned:
+        where = f"{record.variant} on {record.dataset.name} {axes_text(one.axes)}"
+        notes.print(f"tuning {where}: {one.reason}", markup=False, soft_wrap=True)
     for record in records:
         reason = record.skipped_because or record.failed_because
         if record.status not in ("ok",):
@@ -724,7 +768,7 @@ def _summarise(records: list[Any], written: Sequence[Path]) -> None:
     console.print(f"{len(records)} rows: {counted}")
     for path in written:
         console.print(f"wrote {path}", markup=False, soft_wrap=True)
-    if any(record.status in ("wrong", "findings") for record in records):
+    if mistuned or any(record.status in ("wrong", "findings") for record in records):
         sys.exit(WRONG_RESULT)
     if any(record.status == "broken" for record in records):
         sys.exit(1)

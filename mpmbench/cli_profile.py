@@ -102,16 +102,19 @@ def profile(
 
 
 def model_cases(cases: Sequence[Any], gpus: Sequence[Gpu], json_path: Path | None, resume: bool) -> list[Record]:
-    """Run, check and model cases; each record is in --json FILE before the next case begins."""
+    """Run, check and model cases, those with a search at their best; each record is in --json FILE before the next case
+    begins."""
     from mpmbench.profile import profile_cases
     from mpmbench.record import RecordWriter, read_records
+    from mpmbench.tuning import model_tuned
 
     known = read_records(json_path) if resume and json_path is not None and json_path.exists() else []
     writer = RecordWriter(json_path, "append" if resume else "replace") if json_path else None
     try:
         with _progress() as progress:
             keep = writer.write if writer else lambda record: None
-            return profile_cases(cases, gpus, _step_by_step(progress), keep, known)
+            model = model_tuned if any(case.search for case in cases) else profile_cases
+            return model(cases, gpus, _step_by_step(progress), keep, known)
     finally:
         if writer:
             writer.close()

@@ -97,11 +97,9 @@ def contests(cases: Iterable[Any], inputs: Any) -> list[list[Any]]:
 def baseline_of(cases: Sequence[Any], wanted: str = "") -> Any:
     """The case that the others are compared with: the one asked for, else the plainest, else the first."""
     if wanted:
-        found = [case for case in cases if f"{case.label} ".startswith(f"{wanted} ")] or [
-            case for case in cases if case.label.startswith(wanted)
-        ]
-        if found:
-            return found[0]
+        for fits in (str.__eq__, str.startswith):
+            if found := [case for case in cases if fits(case.label, wanted)]:
+                return found[0]
     plain = [case for case in cases if case.is_plain]
     return min(plain, key=lambda case: len(case.label), default=cases[0])
 
@@ -114,14 +112,15 @@ def run_contest(
     timing: Timing | None = None,
     known: Iterable[Any] = (),
     tick: Callable[[str], None] = lambda state: None,
+    baseline: Any = None,
 ) -> Iterator[Record]:
     """Records of cases that answer the same question, one by one as they are finished.
 
     known: those of the cases whose rows are there already; the baseline is timed again beside the missing ones, without
-    a row. tick: told what is going on.
+    a row. tick: told what is going on. baseline: one of the cases, where it is known; else ``baseline_of`` finds it.
     """
     timing = timing or Timing()
-    baseline = baseline_of(cases, timing.baseline)
+    baseline = baseline or baseline_of(cases, timing.baseline)
     silent = {id(case) for case in known}
     missing = [case for case in cases if id(case) not in silent]
     for number, batch in enumerate(_batches(missing, baseline, device, inputs)):

@@ -35,6 +35,8 @@ class PrimitiveCase:
     seed: int = SEED
     preset_row: Mapping[str, Any] | None = None
 
+    search = None  # axes are searched for transfers alone
+
     @property
     def name(self) -> str:
         return self.primitive.name

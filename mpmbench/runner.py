@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,10 +22,13 @@ from mpmbench.device import Device, Launch, LaunchReport
 from mpmbench.environment import Environment, machine_bytes
 from mpmbench.errors import InputError
 from mpmbench.profile_record import Profile
-from mpmbench.record import Check, DatasetSummary, Record, StepCost, line_texts
+from mpmbench.record import Check, DatasetSummary, Record, StepCost, Tuning, line_texts
 from mpmbench.reference import Nodes, ReferenceNodes, ReferenceParticles, g2p, grid_divide, p2g
 from mpmbench.simt.counters import Counters
 from mpmbench.variants import Variant, resolve_axes, why_impossible
+
+if TYPE_CHECKING:
+    from mpmbench.tuning import Search
 
 # The reference, the sums and the allowance of a check, float64, at their peak: measured on 192^3 nodes.
 CHECK_BYTES_PER_NODE = 320
@@ -57,12 +60,18 @@ class DatasetChoice:
 
 @dataclass(frozen=True)
 class Case:
-    """One strategy on one dataset with one choice of axes. ``preset_row``: the published row it repeats, if any."""
+    """One strategy on one dataset with one choice of axes.
+
+    preset_row: the published row it repeats, if any.  search: for better axes than these, before it is run.
+    tuning: the search that its axes come from.
+    """
 
     variant: Variant
     dataset: DatasetChoice
     axes: Mapping[str, Any]
     preset_row: Mapping[str, Any] | None = None
+    search: Search | None = None
+    tuning: Tuning | None = None
 
     @property
     def name(self) -> str:
@@ -110,10 +119,12 @@ class Case:
         return prepare_case(self, device, inputs, environment, cache)
 
     def resume_key(self, device: Device, inputs: Inputs) -> tuple[Any, ...]:
-        """Equal to ``resume_key`` of the Record that this case would repeat."""
+        """Equal to ``resume_key`` of the Record that this case would repeat; with a search, to its ``tuned_key``."""
         fingerprint, row = inputs.select(self.dataset).fingerprint, self.preset_row or {}
-        where = (device.name, device.arch)
-        return (self.name, _axis_key(self.axes), fingerprint, where, row.get("table"), row.get("row"))
+        where, search = (device.name, device.arch), self.search
+        axes = _axis_key(self.axes, search.free if search else ())
+        key = (self.name, axes, fingerprint, where, row.get("table"), row.get("row"))
+        return (*key, *search.key) if search else key
 
 
 def label_of(name: str, axes: Mapping[str, Any], defaults: Mapping[str, Any]) -> str:
@@ -277,6 +288,7 @@ def about_case(case: Case, device: Device, inputs: Inputs, environment: Environm
         "arch": device.arch,
         "environment": replace(environment, gpu=getattr(device, "facts", {})),
         "preset_row": case.preset_row,
+        "tuning": case.tuning,
         "floor_bytes": planning.floor_bytes(variant, dataset, axes),
     }
     if why_impossible(variant, axes) is None:
@@ -341,10 +353,23 @@ def free_bytes(device: Device) -> int:
 
 def resume_key(record: Record) -> tuple[Any, ...]:
     """What makes two rows the same row: a finished Record and the case that would repeat it have equal keys."""
+    return _key(record)
+
+
+def tuned_key(record: Record) -> tuple[Any, ...]:
+    """What makes two rows the same where axes were searched for: which ones and how, and not what came of it. Without a
+    search, ``resume_key``."""
+    tuning = record.tuning
+    if tuning is None:
+        return resume_key(record)
+    return (*_key(record, tuning.searched), tuning.searched, tuning.budget, tuning.possible)
+
+
+def _key(record: Record, searched: Collection[str] = ()) -> tuple[Any, ...]:
     row, where = record.preset_row or {}, (record.device, record.arch)
-    axes = _axis_key(record.axes)
+    axes = _axis_key(record.axes, searched)
     return (record.variant, axes, record.dataset.fingerprint, where, row.get("table"), row.get("row"))
 
 
-def _axis_key(axes: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
-    return tuple(sorted((key, format_axis(value)) for key, value in axes.items()))
+def _axis_key(axes: Mapping[str, Any], searched: Collection[str] = ()) -> tuple[tuple[str, str], ...]:
+    return tuple(sorted((key, format_axis(value)) for key, value in axes.items() if key not in searched))

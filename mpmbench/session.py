@@ -6,11 +6,12 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import nullcontext
 from typing import Any
 
-from mpmbench.contest import Timing, contests, run_contest
+from mpmbench.contest import Timing, baseline_of, contests, run_contest
 from mpmbench.environment import Environment
 from mpmbench.errors import InputError
 from mpmbench.record import Record
-from mpmbench.runner import Inputs, resume_key
+from mpmbench.runner import Inputs, resume_key, tuned_key
+from mpmbench.tuning import settled, tune
 
 Tick = Callable[[str], None]
 
@@ -33,7 +34,7 @@ def run_session(
     known: rows of an earlier run, taken as they are.
     """
     environment, inputs = Environment.capture(), Inputs()
-    kept = {(resume_key(record), record.cache): record for record in known}
+    kept = {(key(record), record.cache): record for record in known for key in (resume_key, tuned_key)}
     for device in devices:
         if not (timings and keeps_time(device)):
             yield from _one_by_one(cases, device, inputs, environment, kept, tick)
@@ -74,15 +75,24 @@ def _contest(
     kept: dict[Any, Record],
     tick: Tick,
 ) -> Iterator[tuple[Record, bool]]:
-    known = []
-    if kept:
-        for case in group:
-            record = kept.get((case.resume_key(device, inputs), timing.cache))
-            if record is not None:
-                known.append(case)
-                yield record, False
-    if len(known) < len(group):
-        told = f"{device.name} {timing.cache}"
-        records = run_contest(group, device, inputs, environment, timing, known, lambda what: tick(f"{told} {what}"))
-        for record in records:
-            yield record, True
+    ready, known = [], []
+    told = f"{device.name} {timing.cache}"
+    for case in group:
+        record = kept.get((case.resume_key(device, inputs), timing.cache)) if kept else None
+        if record is not None:
+            known.append(settled(case, record) if case.search else case)
+            yield record, False
+        ready.append(known[-1] if record is not None else case)
+    if len(known) == len(group):
+        return
+
+    def named(what: str) -> None:
+        tick(f"{told} {what}")
+
+    # The baseline is what was asked for, or the plainest, before its axes are searched for.
+    baseline = ready.index(baseline_of(ready, timing.baseline))
+    for place, case in enumerate(ready):
+        if case.search:
+            ready[place] = tune(case, device, inputs, environment, timing, named)
+    for record in run_contest(ready, device, inputs, environment, timing, known, named, ready[baseline]):
+        yield record, True

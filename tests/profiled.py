@@ -31,6 +31,7 @@ TITLES = {
     "gtx970": "NVIDIA GeForce GTX 970",
     "a100": "NVIDIA A100 80GB",
     "h100": "NVIDIA H100 PCIe",
+    "h200": "NVIDIA H200 (SXM)",
     "rtx4090": "NVIDIA GeForce RTX 4090",
 }
 PEAK = {"warp_inst": 61.2e9, "l1_bytes": 1.2e12, "l2_bytes": 594e9, "dram_bytes": 175e9}

@@ -253,7 +253,8 @@ class Group:
     def device(self) -> str:
         record = self.first
         if record.simulated:
-            return f"simulated device, kernels compiled for {record.arch}"
+            tuned = f", axes searched for {record.tuning.gpu}" if record.tuning and record.tuning.gpu else ""
+            return f"simulated device, kernels compiled for {record.arch}{tuned}"
         if self.kind is Kind.WALL:
             return f"{record.environment.cpu} (CPU, wall clock)"
         return f"{record.environment.gpu.get('name', record.device)}, {record.arch}"
@@ -281,7 +282,8 @@ def group(records: Iterable[Record]) -> list[Group]:
     for r in records:
         problem = tuple(r.axes.get(axis) for axis in PROBLEM_AXES)
         processor = r.environment.cpu if cost_kind(r) is Kind.WALL else r.environment.gpu.get("name")
-        key = (r.dataset.name, r.dataset.fingerprint, r.transfer, problem, r.device, processor, r.arch)
+        tuned_for = r.tuning.gpu if r.tuning else None  # each GPU that is modelled has its own best axes
+        key = (r.dataset.name, r.dataset.fingerprint, r.transfer, problem, r.device, processor, r.arch, tuned_for)
         alike.setdefault((*key, r.environment.gpu.get("uuid")), []).append(r)
     found = _told_apart(
         [Group(tuple(sorted(part, key=_order))) for runs in alike.values() for part in timed_apart(runs)]
