@@ -282,7 +282,7 @@ def group(records: Iterable[Record]) -> list[Group]:
     for r in records:
         problem = tuple(r.axes.get(axis) for axis in PROBLEM_AXES)
         processor = r.environment.cpu if cost_kind(r) is Kind.WALL else r.environment.gpu.get("name")
-        tuned_for = r.tuning.gpu if r.tuning else None  # each GPU that is modelled has its own best axes
+        tuned_for = r.tuning.gpu if r.tuning and r.simulated else None  # each modelled GPU has its own best axes
         key = (r.dataset.name, r.dataset.fingerprint, r.transfer, problem, r.device, processor, r.arch, tuned_for)
         alike.setdefault((*key, r.environment.gpu.get("uuid")), []).append(r)
     found = _told_apart(
