@@ -239,7 +239,9 @@ def _compute_mode(name: str, one: Nvml) -> Check | None:
     mode = one.compute_mode
     if mode == "prohibited":
         return Check(name, "missing", "prohibited: no program may use it", "nvidia-smi --compute-mode=0, as root")
-    return mode and Check(name, "ok", mode if mode.startswith("exclusive") else "shared (default)")
+    if mode is None:
+        return None
+    return Check(name, "ok", mode if mode.startswith("exclusive") else "shared (default)")
 
 
 def _neighbours(name: str, one: Nvml) -> Check | None:
@@ -255,7 +257,7 @@ def _persistence(name: str, one: Nvml) -> Check | None:
     on = one.persistence
     if on is False:
         return Check(name, "warn", "off: settings may be lost between runs", "nvidia-smi --persistence-mode=1, as root")
-    return on and Check(name, "ok", "on")
+    return None if on is None else Check(name, "ok", "on")
 
 
 GPU_LOOKS: tuple[tuple[str, Callable[[str, Nvml], Check | None]], ...] = (

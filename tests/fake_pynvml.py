@@ -1,7 +1,7 @@
 """A stand-in for pynvml that holds every call to the real module's signatures, constants and errors, and logs commands.
 
-nvidia-ml-py imports without a driver, so the real functions are at hand. What the fake has not, the real module has: its
-constants and its errors are used as they are, and a name that it lacks is an AttributeError here too.
+nvidia-ml-py imports without a driver, so the real functions are at hand. What the fake has not, the real module has:
+its constants and its errors are used as they are, and a name that it lacks is an AttributeError here too.
 """
 
 from __future__ import annotations
