@@ -289,6 +289,9 @@ def test_a_handler_of_the_program_is_left_in_place() -> None:
 def test_clocks_are_set_free_at_exit_by_whoever_locked_them() -> None:
     """A block that is never left, and a forked child that must not set free what it did not lock."""
     process = child("""
+        import atexit
+        parent = os.getpid()
+        atexit.register(lambda: os.getpid() == parent and print("over", flush=True))  # the last to run
         lock = one.lock_clocks("max")
         lock.__enter__()
         if os.fork() == 0:
@@ -298,7 +301,7 @@ def test_clocks_are_set_free_at_exit_by_whoever_locked_them() -> None:
         sys.exit(3)
     """)
     out, errors = process.communicate(timeout=30)
-    assert out.split() == [SET, "child", "is", "gone", RESET], errors
+    assert out.split() == [SET, "child", "is", "gone", RESET, "over"], errors
     assert process.returncode == 3
 
 
