@@ -12,7 +12,8 @@ import os
 import signal
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -262,6 +263,37 @@ def _open_devices(names: Sequence[str], arch: str | None, mode: str) -> list[Any
     return [open_device(name, **takes.get(name, {})) for name in names]
 
 
+def _refuse_lock(lock: str, devices: Sequence[str], gpu_names: Sequence[str]) -> None:
+    """Clocks are locked of GPUs that are here and take part, and of no others."""
+    from mpmbench.device.nvml import parse_lock
+
+    parse_lock(lock)
+    if gpu_names or (devices and not any(name.startswith("cuda") for name in devices)):
+        raise InputError("--lock-gpu-clocks is for a GPU that is timed: add -d cuda, or leave it out")
+
+
+@contextmanager
+def _locked_clocks(devices: Iterable[Any], lock: str | None) -> Iterator[None]:
+    """The clocks of all GPUs among the devices are held while the block runs; without a lock they are left alone."""
+    with ExitStack() as stack:
+        if lock is not None:
+            gpus = [device for device in devices if hasattr(device, "lock_clocks")]
+            if not gpus:
+                raise InputError("--lock-gpu-clocks: there is no GPU here to be timed: leave it out")
+            for device in gpus:
+                stack.enter_context(device.lock_clocks(lock))
+        yield
+
+
+def _warn_of_gpus(devices: Iterable[Any]) -> None:
+    """Before an hour of work rather than after it."""
+    from mpmbench import preflight
+
+    for device in devices:
+        for trouble, action in preflight.warnings(getattr(device, "facts", {})):
+            notes.print(f"{device.name}: {trouble}. {action}", markup=False, soft_wrap=True)
+
+
 def _gpu_present() -> bool:
     from mpmbench.device import open_device
 
@@ -370,6 +402,12 @@ def _axis_values(variant: Any) -> dict[str, list[Any]]:
     metavar="NAME",
     help="Strategy that the others are compared with, as the tables name it. Default: unsorted global atomics.",
 )
+@click.option(
+    "--lock-gpu-clocks",
+    "lock",
+    metavar="base|max|MHZ|reset",
+    help="Hold the SM clock of the GPUs while this runs (as root); reset sets it free first.",
+)
 @click.option("--shard", metavar="I/N", help="Run part I of N; what is timed together stays together.")
 @click.option("--resume", is_flag=True, help="Keep the rows of --json FILE, run only what is missing.")
 @click.option("--dry-run", is_flag=True, help="Say what would run, and stop.")
@@ -384,6 +422,7 @@ def run(
     rigorous: bool,
     tune: int | None,
     baseline: str,
+    lock: str | None,
     shard: str | None,
     resume: bool,
     dry_run: bool,
@@ -410,6 +449,8 @@ def run(
     _refuse_targets(outputs, selection["datasets"])
     if tune is not None:
         cases = _to_search(cases, tune, selection["axes"], preset_name)
+    if lock is not None:
+        _refuse_lock(lock, devices, gpu_names)
     if gpu_names:
         _run_modelled(cases, gpu_names, devices, arch, outputs, resume, dry_run)
         return
@@ -432,7 +473,9 @@ def run(
         return
     timings = _timings(caches, quick, rigorous, baseline)
     _refuse_unknown_baseline(cases, baseline)
-    records = _run_cases(cases, opened, json_path, "append" if resume else "replace", timings)
+    with _locked_clocks(opened, lock):
+        _warn_of_gpus(opened)
+        records = _run_cases(cases, opened, json_path, "append" if resume else "replace", timings)
     _write_reports(records, html_path, md_path, csv_path, nvbench_path)
     _summarise(records, [p for p in outputs if p])
 

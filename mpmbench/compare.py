@@ -16,6 +16,7 @@ from typing import Any
 from mpmbench.errors import InputError
 from mpmbench.nvbench import ABSENT, EVENTS, WALL
 from mpmbench.nvbench_rows import Row
+from mpmbench.preflight import MOMENTARY
 from mpmbench.robust_rule import Judgement, RobustRule
 
 # Keys of an environment that say nothing about a time. Kernels are compared by their hashes, not by commits.
@@ -296,5 +297,6 @@ def environment_differences(pairs: Sequence[tuple[Row, Row]], allow: Sequence[st
 def _environment(row: Row) -> dict[str, Any]:
     """What can change the row's time, kernels by the start of their hash."""
     ignored = NEVER_MATTER if row.kind == WALL else (*NEVER_MATTER, *HOST)
-    facts = {key: value for key, value in row.environment.items() if key not in ignored}
+    lasting = {key: value for key, value in row.environment.items() if not key.endswith(MOMENTARY)}
+    facts = {key: value for key, value in lasting.items() if key not in ignored}
     return facts | {f"kernel.{name}": sha[:12] for name, sha in row.hashes.items()}

@@ -8,12 +8,13 @@ import platform
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import metadata
-from typing import Any, Literal
+from pathlib import Path
+from typing import Literal
 
+from mpmbench.device.nvml import Nvml
 from mpmbench.errors import MpmbenchError
 
 Status = Literal["ok", "warn", "missing"]
@@ -22,7 +23,7 @@ GIB = 2**30
 WANTED_DISK = GIB  # caches and records of a full run
 WANTED_MEMORY = 8 * GIB  # the thesis preset at full size
 OLDEST_ARCH = "sm_52"  # of the thesis, GTX 970
-LOCKABLE_ARCH = (7, 0)  # nvmlDeviceSetGpuLockedClocks: Volta and later
+DRIVER_PARAMETERS = Path("/proc/driver/nvidia/params")
 CUPY = ("cupy-cuda12x", "cupy-cuda13x")
 INSTALL_CUPY = "pip install 'mpmbench[cuda12x]' (CUDA 12 driver) or 'mpmbench[cuda13x]' (CUDA 13 driver)"
 NO_GPU = "none needed for counters and checks; times need a machine with an NVIDIA GPU"
@@ -194,63 +195,106 @@ def gpu() -> list[Check]:
 
 
 def driver() -> list[Check]:
-    """What the driver's management library says: version, clocks, compute mode, other programs on the GPU."""
+    """What the driver's management library says: version, and of each GPU what times depend on."""
     if not _installed("nvidia-ml-py"):
         return [Check("nvidia-ml-py", "missing", "not installed: clocks are not watched", "pip install nvidia-ml-py")]
-    nvml = importlib.import_module("pynvml")
+    gpus, reason = Nvml.all()
     version = f"nvidia-ml-py {metadata.version('nvidia-ml-py')}"
-    try:
-        nvml.nvmlInit()
-    except nvml.NVMLError as error:
-        return [Check("driver", "missing", f"{version} finds none: {_one_line(error)}", NO_GPU)]
-    try:
-        checks = [Check("driver", "ok", f"{_text(nvml.nvmlSystemGetDriverVersion())} ({version})")]
-        for index in range(nvml.nvmlDeviceGetCount()):
-            handle = nvml.nvmlDeviceGetHandleByIndex(index)
-            label = f"NVML {index} ({_text(nvml.nvmlDeviceGetName(handle))})"
-            for name, look in (("clocks", _clocks), ("compute mode", _compute_mode), ("neighbours", _neighbours)):
-                with _refusals(checks, f"{label}: {name}", nvml):
-                    checks.append(look(f"{label}: {name}", nvml, handle))
-        return checks
-    finally:
-        nvml.nvmlShutdown()
+    if reason:
+        return [Check("driver", "missing", f"{version} finds none: {reason}", NO_GPU)]
+    checks = [Check("driver", "ok", f"{gpus[0].driver if gpus else 'no GPU'} ({version})")]
+    for index, one in enumerate(gpus):
+        for name, look in GPU_LOOKS:
+            label = f"NVML {index} ({one.name}): {name}"
+            checks.append(
+                look(label, one) or Check(label, "warn", f"not told: {one.refusal}", "look at it with nvidia-smi")
+            )
+    return checks
 
 
-def _clocks(name: str, nvml: Any, handle: Any) -> Check:
-    now = nvml.nvmlDeviceGetClockInfo(handle, nvml.NVML_CLOCK_SM)
-    highest = nvml.nvmlDeviceGetMaxClockInfo(handle, nvml.NVML_CLOCK_SM)
+def _clocks(name: str, one: Nvml) -> Check | None:
+    now, highest = one.sm_clock, one.sm_clock_max
+    if now is None or highest is None:
+        return None
     detail = f"SM at {now} of {highest} MHz"
-    if tuple(nvml.nvmlDeviceGetCudaComputeCapability(handle)) < LOCKABLE_ARCH:
+    if one.lockable is False:
         cure = "warm the GPU up before long comparisons; compare only runs of one session"
         return Check(name, "warn", f"{detail}; this GPU cannot lock its clocks", cure)
     if os.geteuid() != 0:
         cure = f"for steady times ask an administrator: nvidia-smi --lock-gpu-clocks={highest}"
         return Check(name, "warn", f"{detail}; only root may lock them", cure)
-    return Check(name, "ok", f"{detail}; may be locked: nvidia-smi --lock-gpu-clocks={highest}")
+    return Check(name, "ok", f"{detail}; may be locked: mpmbench run --lock-gpu-clocks base")
 
 
-def _compute_mode(name: str, nvml: Any, handle: Any) -> Check:
-    mode = nvml.nvmlDeviceGetComputeMode(handle)
-    if mode == nvml.NVML_COMPUTEMODE_PROHIBITED:
+def _throttle(name: str, one: Nvml) -> Check | None:
+    why = one.throttle_reasons()
+    if why is None:
+        return None
+    if why:
+        return Check(name, "warn", f"held down: {why}", "let the GPU cool down, or raise its power limit")
+    return Check(name, "ok", "nothing holds the clocks down")
+
+
+def _compute_mode(name: str, one: Nvml) -> Check | None:
+    mode = one.compute_mode
+    if mode == "prohibited":
         return Check(name, "missing", "prohibited: no program may use it", "nvidia-smi --compute-mode=0, as root")
-    exclusive = mode == nvml.NVML_COMPUTEMODE_EXCLUSIVE_PROCESS
-    return Check(name, "ok", "exclusive process" if exclusive else "shared (default)")
+    if mode is None:
+        return None
+    return Check(name, "ok", mode if mode.startswith("exclusive") else "shared (default)")
 
 
-def _neighbours(name: str, nvml: Any, handle: Any) -> Check:
-    others = [p.pid for p in nvml.nvmlDeviceGetComputeRunningProcesses(handle) if p.pid != os.getpid()]
+def _neighbours(name: str, one: Nvml) -> Check | None:
+    if one.process_ids is None:
+        return None
+    others = [number for number in one.process_ids if number != os.getpid()]
     if others:
         return Check(name, "warn", f"{len(others)} other programs compute on this GPU", "time on a GPU of your own")
     return Check(name, "ok", "no other program computes on this GPU")
 
 
-@contextmanager
-def _refusals(checks: list[Check], name: str, nvml: Any) -> Iterator[None]:
-    """A question that a GPU or a container does not answer is a line, not the end."""
+def _persistence(name: str, one: Nvml) -> Check | None:
+    on = one.persistence
+    if on is False:
+        return Check(name, "warn", "off: settings may be lost between runs", "nvidia-smi --persistence-mode=1, as root")
+    return None if on is None else Check(name, "ok", "on")
+
+
+GPU_LOOKS: tuple[tuple[str, Callable[[str, Nvml], Check | None]], ...] = (
+    ("clocks", _clocks),
+    ("throttling", _throttle),
+    ("compute mode", _compute_mode),
+    ("neighbours", _neighbours),
+    ("persistence", _persistence),
+)
+
+
+def counters() -> list[Check]:
+    """Whether the driver lets programs read hardware counters, which Nsight Compute needs and times do not."""
     try:
-        yield
-    except nvml.NVMLError as error:
-        checks.append(Check(name, "warn", f"not told: {_one_line(error)}", "look at it with nvidia-smi"))
+        text = DRIVER_PARAMETERS.read_text()
+    except OSError:
+        return []  # no driver, or a container that hides it
+    found = re.search(r"^RmProfilingAdminOnly:\s*(\d+)", text, re.MULTILINE)
+    if found is None:
+        return [Check("counters", "warn", "the driver does not tell who may read them", "try: ncu --query-metrics")]
+    if found[1] == "0":
+        return [Check("counters", "ok", "every user may read them")]
+    if os.geteuid() == 0:
+        return [Check("counters", "ok", "root may read them")]
+    cure = "run ncu as root, or as root set the module option nvidia NVreg_RestrictProfilingToAdminUsers=0 and reboot"
+    return [Check("counters", "warn", "only root may read them (RmProfilingAdminOnly)", cure)]
+
+
+def ncu() -> list[Check]:
+    """Nsight Compute, for counters beside the model's. Asked for only where there is a driver."""
+    if not DRIVER_PARAMETERS.exists():
+        return []
+    found = shutil.which("ncu")
+    if found is None:
+        cure = "install Nsight Compute and put its folder on PATH, or do without --ncu-csv"
+        return [Check("ncu", "missing", "not on PATH: no hardware counters", cure)]
+    return [Check("ncu", "ok", found)]
 
 
 # Versions
@@ -290,10 +334,6 @@ def _installed(distribution: str) -> bool:
     return True
 
 
-def _text(value: str | bytes) -> str:
-    return value.decode() if isinstance(value, bytes) else value
-
-
 def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split())[:200]
 
@@ -310,4 +350,6 @@ LOOKS: tuple[tuple[str, Callable[[], list[Check]]], ...] = (
     ("CUDA headers", headers),
     ("GPU", gpu),
     ("driver", driver),
+    ("counters", counters),
+    ("ncu", ncu),
 )

@@ -1,8 +1,8 @@
 """Times of single steps that nothing competes with (sorting, clearing): warm-up, samples, and when to stop.
 
 One sample is: reset the outputs, flush the second-level cache, wait, hold the stream, event, the step's kernels, event,
-wait. Outputs are reset and the cache is flushed outside the timed span. The protocol follows NVBench (cold
-measurements: NVIDIA/nvbench, docs/benchmarks.md) except for the stop rule, which bounds the median instead of the
+let the stream go, wait. Outputs are reset and the cache is flushed outside the timed span. The protocol follows NVBench
+(cold measurements: NVIDIA/nvbench, docs/benchmarks.md) except for the stop rule, which bounds the median instead of the
 mean: samples of a GPU have outliers on one side only.
 
 The module needs of a device only what ``TimedDevice`` lists, so a test can drive it with a scripted clock.
@@ -24,10 +24,6 @@ from mpmbench.record import Measurement
 # Below this, the resolution of events (about 0.5 us, CUDA Runtime API, cudaEventElapsedTime) exceeds 2 %.
 SHORTEST_RANKED = 20e-6  # [s]
 
-# The stream is held while the host enqueues a sample: Python needs some 10 us per call.
-HOLD_SECONDS = 30e-6
-HOLD_SECONDS_PER_LAUNCH = 20e-6
-
 
 class TimedDevice(Protocol):
     """What sampling needs of a device; ``CudaDevice`` has it, the simulated device has no time and does not."""
@@ -40,7 +36,12 @@ class TimedDevice(Protocol):
 
     def flush_cache(self) -> None: ...
 
-    def hold(self, seconds: float) -> None: ...
+    def hold(self) -> None: ...
+
+    def release(self) -> None: ...
+
+    @property
+    def hold_expired(self) -> bool: ...
 
     def record(self) -> Any: ...
 
@@ -123,16 +124,24 @@ def measure_steps(
 
 
 def sample_step(device: TimedDevice, step: TimedStep, mode: str) -> float:
-    """Time of one step [s], the cache flushed before it in mode "cold"."""
+    """Time of one step [s], the cache flushed before it in mode "cold". Its kernels must have run before.
+
+    Raises InputError where a launch waited for the stream that is held until all are made.
+    """
     if mode == "cold":
         device.flush_cache()
     device.synchronize()
-    device.hold(HOLD_SECONDS + HOLD_SECONDS_PER_LAUNCH * len(step.launches))
-    start = device.record()
-    for launch in step.launches:
-        device.launch(launch)
-    end = device.record()
+    device.hold()
+    try:
+        start = device.record()
+        for launch in step.launches:
+            device.launch(launch)
+        end = device.record()
+    finally:
+        device.release()
     device.synchronize()
+    if device.hold_expired:
+        raise InputError(f"{device.name}: {step.name} cannot be timed: a launch of it waits for the ones before it")
     seconds = device.elapsed(start, end)
     if step.after is not None:
         step.after()

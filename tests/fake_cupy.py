@@ -7,6 +7,7 @@ fails here as it would fail on a GPU. The timeline is scripted: kernels take the
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import inspect
 import re
@@ -131,6 +132,11 @@ class FakeGpu:
     now: float = 0.0  # [s] on the device's timeline
     used: int = 0
     pooled: int = 0  # bytes that CuPy's pool holds without using them
+    uuid: bytes = bytes(range(1, 17))
+    pci_bus_id: str = "0000:01:00.0"
+    hertz: float = 1e9  # of SM 0
+    on_sm_0: bool = True  # whether a thread block of a stamp lands there
+    held: tuple[int, int, int] | None = None  # addresses of let go and expired, ticket
     streams: list[Any] = field(default_factory=list)  # the current one is last; empty: the default stream
     devices: list[int] = field(default_factory=lambda: [0])
 
@@ -196,6 +202,7 @@ def fake_cupy(gpu: FakeGpu) -> SimpleNamespace:
 
         @follows("cuda.Stream.synchronize")
         def synchronize(self) -> None:
+            end_hold(gpu)
             gpu.log("sync", self)
             if gpu.fail_synchronize is not None:
                 raise gpu.fail_synchronize
@@ -270,8 +277,15 @@ def fake_cupy(gpu: FakeGpu) -> SimpleNamespace:
             assert gpu.streams, "launched on the default stream"
             if gpu.fail_launch is not None:
                 raise gpu.fail_launch
-            if gpu.execute is not None and self.name != "mpmbench_hold":
-                gpu.execute(self.ptx, self.name, grid, block, tuple(_by_value(a) for a in args), shared_mem)
+            values = tuple(_by_value(a) for a in args)
+            if self.name == "mpmbench_hold":
+                assert gpu.held is None, "held twice"
+                gpu.held = int(values[0]), int(values[1]), int(values[2])
+            elif self.name == "mpmbench_stamp":
+                assert grid == (4, 1, 1), "a thread block for each SM"
+                play_stamp(gpu, *values)
+            elif gpu.execute is not None:
+                gpu.execute(self.ptx, self.name, grid, block, values, shared_mem)
             gpu.now += gpu.seconds.get(self.name, 1e-5)
             gpu.log("kernel", SimpleNamespace(name=self.name, grid=grid, block=block, args=args, shared=shared_mem,
                                               stream=gpu.streams[-1]))  # fmt: skip
@@ -300,6 +314,23 @@ def fake_cupy(gpu: FakeGpu) -> SimpleNamespace:
             kernel.load()
             return kernel
 
+    class PinnedMemory:
+        @follows("cuda.PinnedMemory")
+        def __init__(self, size: int, flags: int = 0) -> None:
+            assert flags == real("cuda.runtime.hostAllocMapped")
+            self.size = size
+
+    @follows("cuda.PinnedMemoryPointer")
+    def pinned_memory_pointer(mem: PinnedMemory, offset: int) -> Any:
+        assert offset == 0
+        buffer = (ctypes.c_uint8 * mem.size)()
+
+        class Pointer(type(buffer)):  # type: ignore[misc]
+            ptr = property(ctypes.addressof)
+
+        real("cuda.PinnedMemoryPointer.ptr")
+        return Pointer()
+
     class Pool:
         @follows("cuda.MemoryPool.free_bytes")
         def free_bytes(self) -> int:
@@ -323,6 +354,7 @@ def fake_cupy(gpu: FakeGpu) -> SimpleNamespace:
     @follows("asnumpy")
     def asnumpy(a: Array, blocking: bool = True) -> np.ndarray:
         assert blocking
+        end_hold(gpu)
         if gpu.fail_synchronize is not None:
             raise gpu.fail_synchronize
         return a.host.copy()
@@ -353,7 +385,7 @@ def fake_cupy(gpu: FakeGpu) -> SimpleNamespace:
             "memoryClockRate": 2_000_000, "memoryBusWidth": 256, "ECCEnabled": 0,
             "maxThreadsPerMultiProcessor": 2048, "maxBlocksPerMultiProcessor": 32, "regsPerMultiprocessor": 65_536,
             "sharedMemPerMultiprocessor": gpu.shared_optin + 1024, "reservedSharedMemPerBlock": 1024,
-            "uuid": b"\0" * 16,
+            "uuid": gpu.uuid, "kernelExecTimeoutEnabled": 0,
         }  # fmt: skip
         assert device < gpu.count
         return properties
@@ -361,6 +393,15 @@ def fake_cupy(gpu: FakeGpu) -> SimpleNamespace:
     @follows("cuda.runtime.driverGetVersion")
     def driver_get_version() -> int:
         return 12090
+
+    @follows("cuda.runtime.runtimeGetVersion")
+    def runtime_get_version() -> int:
+        return 12080
+
+    @follows("cuda.runtime.deviceGetPCIBusId")
+    def device_get_pci_bus_id(device: int) -> str:
+        assert device < gpu.count
+        return gpu.pci_bus_id
 
     @follows("cuda.nvrtc.getVersion")
     def nvrtc_get_version() -> tuple[int, int]:
@@ -379,6 +420,8 @@ def fake_cupy(gpu: FakeGpu) -> SimpleNamespace:
             Device=Device,
             Event=Event,
             Stream=Stream,
+            PinnedMemory=PinnedMemory,
+            PinnedMemoryPointer=pinned_memory_pointer,
             get_elapsed_time=get_elapsed_time,
             compiler=SimpleNamespace(CompileException=cupy.cuda.compiler.CompileException),
             memory=SimpleNamespace(OutOfMemoryError=cupy.cuda.memory.OutOfMemoryError),
@@ -386,12 +429,33 @@ def fake_cupy(gpu: FakeGpu) -> SimpleNamespace:
             runtime=SimpleNamespace(
                 getDeviceCount=get_device_count,
                 getDeviceProperties=get_device_properties,
+                deviceGetPCIBusId=device_get_pci_bus_id,
                 driverGetVersion=driver_get_version,
+                hostAllocMapped=real("cuda.runtime.hostAllocMapped"),
+                runtimeGetVersion=runtime_get_version,
             ),
         ),
     )
     _assert_names_exist(fake, "")
     return fake
+
+
+def end_hold(gpu: FakeGpu) -> None:
+    """What waiting for the stream comes to while it is held: not let go, the hold ends by itself and says so."""
+    if gpu.held is None:
+        return
+    let_go, expired, ticket = gpu.held
+    gpu.held = None
+    if ctypes.c_uint32.from_address(let_go).value < ticket:
+        ctypes.c_uint32.from_address(expired).value = ticket
+        gpu.log("hold expired")
+
+
+def play_stamp(gpu: FakeGpu, stamps: np.ndarray, number: np.uint64) -> None:
+    """The clocks at this moment of the scripted timeline, where the stamp kernel writes them."""
+    if gpu.on_sm_0:
+        nanoseconds = round(gpu.now * 1e9) + 1
+        stamps[int(number) % 2] = number, round(nanoseconds * 1e-9 * gpu.hertz) + 7, nanoseconds
 
 
 def on_the_engine(spoil: Callable[[str, tuple[Any, ...]], None] = lambda name, arguments: None) -> Callable[..., None]:

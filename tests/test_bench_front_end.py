@@ -24,7 +24,9 @@ class Scripted(SimulatedDevice):
     now = 0.0
     times = itertools.cycle([0.003, 0.001, 0.002])
     def flush_cache(self): self.now += 5.0
-    def hold(self, seconds): self.now += seconds
+    hold_expired = False
+    def hold(self): self.now += 1.0
+    def release(self): pass
     def record(self): return self.now
     def elapsed(self, start, end):
         return next(self.times)

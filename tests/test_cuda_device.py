@@ -16,8 +16,10 @@ import pytest
 from fake_cupy import FakeGpu, compile_as_cupy_does, documented_signature, fake_cupy
 
 from mpmbench.device import KernelInfo, Launch, open_device
-from mpmbench.device.cuda import HOLD_SOURCE, CudaDevice, cupy_options, list_gpus
+from mpmbench.device.cuda import CudaDevice, cupy_options, list_gpus
+from mpmbench.device.cuda_timing import HOLD_LIMIT, KERNELS
 from mpmbench.device.ptxas import kernel_infos
+from mpmbench.device.simulated import SimulatedDevice
 from mpmbench.errors import InputError
 from mpmbench.kernel import COMPILE_OPTIONS, KernelSource, compile_options
 
@@ -177,30 +179,109 @@ def test_large_shared_memory_is_asked_for_once(gpu: FakeGpu) -> None:
     assert launch.kernel.handle.max_dynamic_shared_size_bytes == 100_000
 
 
+def calls(gpu: FakeGpu) -> list[str]:
+    return [detail.name if what == "kernel" else what for what, detail in gpu.calls]
+
+
 def test_timing_calls(gpu: FakeGpu) -> None:
     device = CudaDevice("cuda:0")
     launch = axpy_launch(device)
-    gpu.seconds = {"axpy": 0.0025}
-    device.flush_cache()
+    gpu.seconds, gpu.hertz = {"axpy": 0.0025}, 1.5e9
+    device.hold()
+    device.release()
     device.synchronize()
-    device.hold(50e-6)
+    warm = calls(gpu)
+    assert warm.index("mpmbench_stamp") < warm.index("sync"), "both kernels are loaded before the first hold"
+    gpu.calls.clear()
+    device.hold()
+    first = device.stamp()
     start = device.record()
     device.launch(launch)
     end = device.record()
+    second = device.stamp()
+    device.release()
     device.synchronize()
     assert device.elapsed(start, end) == pytest.approx(0.0025)
-    assert gpu.names()[-7:] == ["flush", "sync", "kernel", "event", "kernel", "event", "sync"]
-    size, stream = gpu.details("flush")[0]
-    assert size == 2 * gpu.l2_bytes
-    assert all(used is stream for used in (*gpu.details("sync"), *gpu.details("event")))
+    assert device.clock_between(first, second) == pytest.approx(1.5e9, rel=1e-5)
+    assert not device.hold_expired
+    assert calls(gpu) == ["mpmbench_hold", "mpmbench_stamp", "event", "axpy", "event", "mpmbench_stamp", "sync"]
+    hold, stamp, *_ = gpu.details("kernel")
+    assert (hold.grid, hold.block, stamp.block) == ((1, 1, 1), (1, 1, 1), (1, 1, 1))
+    assert hold.args[3] == np.uint64(HOLD_LIMIT * 1e9)
+    stream = gpu.details("sync")[0]
+    assert all(used is stream for used in gpu.details("event"))
     assert all(call.stream is stream for call in gpu.details("kernel"))
-    assert gpu.details("kernel")[-2].args == (np.uint64(50_000),)
 
 
-@pytest.mark.parametrize("arch", ["sm_52", "sm_90", "sm_120"])
-def test_hold_kernel_compiles_for_every_gpu(arch: str) -> None:
-    ptx = compile_as_cupy_does(HOLD_SOURCE, cupy_options(COMPILE_OPTIONS), arch.removeprefix("sm_"))
-    assert kernel_infos(ptx, arch)["mpmbench_hold"].spill_bytes == 0
+def test_flush_overwrites_twice_the_cache(gpu: FakeGpu) -> None:
+    device = CudaDevice("cuda")
+    device.flush_cache()
+    device.synchronize()
+    ((size, stream),) = gpu.details("flush")
+    assert size == 2 * gpu.l2_bytes
+    assert stream is gpu.details("sync")[-1]
+
+
+def test_a_hold_that_is_not_let_go_says_so_and_the_next_one_is_good(gpu: FakeGpu) -> None:
+    device = CudaDevice("cuda")
+    device.hold()
+    device.synchronize()
+    assert device.hold_expired
+    assert "hold expired" in gpu.names()
+    device.hold()
+    device.release()
+    device.synchronize()
+    assert not device.hold_expired
+
+
+def test_no_clock_where_no_thread_block_lands_on_sm_0(gpu: FakeGpu) -> None:
+    device = CudaDevice("cuda")
+    first, gpu.on_sm_0 = device.stamp(), False
+    second = device.stamp()
+    device.synchronize()
+    assert device.clock_between(first, second) is None
+    gpu.on_sm_0 = True
+    third, fourth = device.stamp(), device.stamp()
+    device.synchronize()
+    assert device.clock_between(third, fourth) == pytest.approx(gpu.hertz, rel=1e-3)
+    assert device.clock_between(first, fourth) is None, "a stamp that was overwritten"
+
+
+TIMED_ARCHS = ["sm_52", "sm_70", "sm_90", "sm_120"]
+
+
+@pytest.mark.parametrize("arch", TIMED_ARCHS)
+def test_timing_kernels_compile_for_every_gpu(arch: str) -> None:
+    ptx = compile_as_cupy_does(KERNELS.text, cupy_options(COMPILE_OPTIONS), arch.removeprefix("sm_"))
+    for entry in ("mpmbench_hold", "mpmbench_stamp"):
+        assert kernel_infos(ptx, arch)[entry].spill_bytes == 0
+    assert "ld.volatile" in ptx, "a read that may be cached never sees the host's word"
+
+
+@pytest.mark.parametrize("arch", TIMED_ARCHS)
+def test_hold_kernel_ends_when_let_go_and_says_when_it_was_not(arch: str) -> None:
+    """On the NumPy executor, whose clocks count instructions."""
+    device = SimulatedDevice(arch, mode="oracle")
+    kernel = device.compile(KERNELS, "mpmbench_hold")
+    let_go, expired = device.upload(np.array([5], np.uint32)), device.upload(np.zeros(1, np.uint32))
+    for ticket, says in ((4, 0), (5, 0), (6, 6)):
+        arguments = (let_go, expired, np.uint32(ticket), np.uint64(300))
+        device.launch(Launch("hold", kernel, (1, 1, 1), (1, 1, 1), arguments))
+        assert expired[0] == says
+
+
+@pytest.mark.parametrize("arch", TIMED_ARCHS)
+def test_stamp_kernel_reads_both_clocks_once(arch: str) -> None:
+    device = SimulatedDevice(arch, mode="oracle")
+    kernel = device.compile(KERNELS, "mpmbench_stamp")
+    stamps = device.upload(np.zeros((2, 3), np.uint64))
+    for number in (7, 8):
+        device.launch(Launch("stamp", kernel, (3, 1, 1), (1, 1, 1), (stamps, np.uint64(number))))
+    assert stamps[:, 0].tolist() == [8, 7]
+    assert (stamps[:, 1:] > 0).all()
+    # Both count instructions there, and the first of three blocks has the word.
+    assert (abs(stamps[:, 1].astype(int) - stamps[:, 2].astype(int)) < 5).all()
+    assert (stamps[:, 1] < 30).all()
 
 
 # Errors

@@ -6,11 +6,12 @@ import sys
 from importlib import metadata
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
+import pynvml
 import pytest
 from click.testing import CliRunner
 from fake_cupy import FakeGpu, fake_cupy
+from fake_pynvml import FakeNvml, NvmlGpu
 
 from mpmbench import doctor
 from mpmbench.cli import main
@@ -161,52 +162,27 @@ def test_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     assert doctor.gpu()[0].status == "missing"
 
 
-class NVMLError(Exception):
-    pass
-
-
-def fake_nvml(**changes: Any) -> SimpleNamespace:
-    """The part of pynvml that the doctor asks; names as in nvidia-ml-py 13."""
-    answers: dict[str, Any] = {
-        "NVMLError": NVMLError,
-        "NVML_CLOCK_SM": 1,
-        "NVML_COMPUTEMODE_PROHIBITED": 2,
-        "NVML_COMPUTEMODE_EXCLUSIVE_PROCESS": 3,
-        "nvmlInit": lambda: None,
-        "nvmlShutdown": lambda: None,
-        "nvmlSystemGetDriverVersion": lambda: "580.65",
-        "nvmlDeviceGetCount": lambda: 1,
-        "nvmlDeviceGetHandleByIndex": lambda index: object(),
-        "nvmlDeviceGetName": lambda handle: b"NVIDIA GeForce GTX 970",
-        "nvmlDeviceGetClockInfo": lambda handle, type: 1050,
-        "nvmlDeviceGetMaxClockInfo": lambda handle, type: 1500,
-        "nvmlDeviceGetCudaComputeCapability": lambda handle: (9, 0),
-        "nvmlDeviceGetComputeMode": lambda handle: 0,
-        "nvmlDeviceGetComputeRunningProcesses": lambda handle: [],
-    }
-    return SimpleNamespace(**{**answers, **changes})
-
-
 @pytest.mark.parametrize(
     ("changes", "what", "status", "remedy"),
     [
         ({}, "compute mode", "ok", ""),
         ({}, "neighbours", "ok", ""),
-        ({"nvmlDeviceGetCudaComputeCapability": lambda handle: (5, 2)}, "clocks", "warn", "one session"),
-        ({"nvmlDeviceGetComputeMode": lambda handle: 2}, "compute mode", "missing", "--compute-mode=0"),
-        (
-            {"nvmlDeviceGetComputeRunningProcesses": lambda handle: [SimpleNamespace(pid=1)]},
-            "neighbours",
-            "warn",
-            "of your own",
-        ),
+        ({}, "throttling", "ok", ""),
+        ({}, "persistence", "ok", ""),
+        ({"capability": (5, 2)}, "clocks", "warn", "one session"),
+        ({"reasons": 0x4 | 0x1}, "throttling", "warn", "power limit"),
+        ({"compute_mode": 2}, "compute mode", "missing", "--compute-mode=0"),
+        ({"processes": [1]}, "neighbours", "warn", "of your own"),
+        ({"persistence": 0}, "persistence", "warn", "--persistence-mode=1"),
     ],
 )
 def test_driver(monkeypatch: pytest.MonkeyPatch, changes, what, status, remedy) -> None:
     installed(monkeypatch, nvidia_ml_py="13.0")
-    monkeypatch.setitem(sys.modules, "pynvml", fake_nvml(**changes))
+    gpu = NvmlGpu(name="NVIDIA GeForce GTX 970", **{"processes": [], **changes})
+    monkeypatch.setitem(sys.modules, "pynvml", FakeNvml(gpu))
     found = by_name(doctor.driver())
     assert found["driver"].status == "ok"
+    assert "580.65.06" in found["driver"].detail
     check = found[f"NVML 0 (NVIDIA GeForce GTX 970): {what}"]
     assert check.status == status
     assert remedy in check.remedy
@@ -215,26 +191,61 @@ def test_driver(monkeypatch: pytest.MonkeyPatch, changes, what, status, remedy) 
 @pytest.mark.parametrize(("user", "status"), [(0, "ok"), (1000, "warn")])
 def test_clocks_may_be_locked_by_root_only(monkeypatch: pytest.MonkeyPatch, user: int, status: str) -> None:
     installed(monkeypatch, nvidia_ml_py="13.0")
-    monkeypatch.setitem(sys.modules, "pynvml", fake_nvml())
+    fake = FakeNvml(NvmlGpu(sm_clock_max=1500))
+    monkeypatch.setitem(sys.modules, "pynvml", fake)
     monkeypatch.setattr("os.geteuid", lambda: user)
-    check = by_name(doctor.driver())["NVML 0 (NVIDIA GeForce GTX 970): clocks"]
+    check = by_name(doctor.driver())["NVML 0 (Fake GPU): clocks"]
     assert check.status == status
-    assert "--lock-gpu-clocks=1500" in check.detail + check.remedy
+    assert "--lock-gpu-clocks" in check.detail + check.remedy
+    assert fake.commands == [], "a doctor changes nothing"
 
 
 def test_questions_that_the_driver_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: Any) -> Any:
-        raise NVMLError("Insufficient Permissions")
-
+    refused = {
+        f"nvmlDeviceGet{question}": pynvml.NVML_ERROR_NO_PERMISSION
+        for question in ("ClockInfo", "CurrentClocksEventReasons", "CurrentClocksThrottleReasons", "PersistenceMode")
+    }
     installed(monkeypatch, nvidia_ml_py="13.0")
-    monkeypatch.setitem(sys.modules, "pynvml", fake_nvml(nvmlDeviceGetClockInfo=refuse))
+    monkeypatch.setitem(sys.modules, "pynvml", FakeNvml(NvmlGpu(processes=[], refuses=refused)))
     found = by_name(doctor.driver())
-    assert found["NVML 0 (NVIDIA GeForce GTX 970): clocks"].detail == "not told: Insufficient Permissions"
-    assert found["NVML 0 (NVIDIA GeForce GTX 970): neighbours"].status == "ok"
-    monkeypatch.setitem(sys.modules, "pynvml", fake_nvml(nvmlInit=refuse))
+    for what in ("clocks", "throttling", "persistence"):
+        assert found[f"NVML 0 (Fake GPU): {what}"].detail == "not told: Insufficient Permissions"
+    assert found["NVML 0 (Fake GPU): neighbours"].status == "ok"
+    monkeypatch.setitem(sys.modules, "pynvml", FakeNvml(fail_init=pynvml.NVML_ERROR_DRIVER_NOT_LOADED))
     assert doctor.driver()[0].status == "missing"
+    assert "Driver Not Loaded" in doctor.driver()[0].detail
     installed(monkeypatch, nvidia_ml_py=None)
     assert doctor.driver()[0].remedy == "pip install nvidia-ml-py"
+
+
+@pytest.mark.parametrize(
+    ("text", "user", "status"),
+    [
+        ("RmProfilingAdminOnly: 0\n", 1000, "ok"),
+        ("A: 1\nRmProfilingAdminOnly: 1\nB: 0\n", 1000, "warn"),
+        ("RmProfilingAdminOnly: 1\n", 0, "ok"),
+        ("A: 1\n", 1000, "warn"),
+    ],
+)
+def test_who_may_read_counters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text, user, status) -> None:
+    parameters = tmp_path / "params"
+    monkeypatch.setattr(doctor, "DRIVER_PARAMETERS", parameters)
+    assert doctor.counters() == doctor.ncu() == [], "no driver, no counters to speak of"
+    parameters.write_text(text)
+    monkeypatch.setattr("os.geteuid", lambda: user)
+    (check,) = doctor.counters()
+    assert check.status == status
+    assert (status == "ok") == (not check.remedy)
+
+
+def test_ncu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    parameters = tmp_path / "params"
+    parameters.touch()
+    monkeypatch.setattr(doctor, "DRIVER_PARAMETERS", parameters)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert doctor.ncu()[0].status == "missing"
+    (tmp_path / "ncu").touch(mode=0o755)
+    assert doctor.ncu() == [Check("ncu", "ok", str(tmp_path / "ncu"))]
 
 
 def test_this_gpu_is_described(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,6 +44,7 @@ class ScriptedDevice:
     name: str = "cuda:0"
     now: float = 0.0
     calls: list[str] = field(default_factory=list)
+    hold_expired: bool = False
 
     def launch(self, launch: Any) -> None:
         self.now += next(self.times[launch]) if launch in self.times else 0.0
@@ -56,10 +57,12 @@ class ScriptedDevice:
         self.now += 1.0
         self.calls.append("flush")
 
-    def hold(self, seconds: float) -> None:
-        assert 0 < seconds < 0.01
-        self.now += seconds
+    def hold(self) -> None:
+        self.now += 1.0
         self.calls.append("hold")
+
+    def release(self) -> None:
+        self.calls.append("release")
 
     def record(self) -> float:
         self.calls.append("event")
@@ -81,7 +84,7 @@ def noisy(seconds: float, relative: float, seed: int) -> Iterator[float]:
 
 
 FEW = Sampling(min_samples=3, max_samples=3, warmup_seconds=0, warmup_limit=0)
-SAMPLE = ["flush", "sync", "hold", "event", "K", "event", "sync"]
+SAMPLE = ["flush", "sync", "hold", "event", "K", "event", "release", "sync"]
 
 
 RESET = [Step("r", ("R",))]
@@ -97,7 +100,20 @@ def test_order_of_calls_of_a_cold_sample() -> None:
 def test_warm_sample_is_not_flushed() -> None:
     device = ScriptedDevice({"K": constant(0.001)})
     measure.sample_step(device, Step("transfer", ("K", "K")), "step")
-    assert device.calls == ["sync", "hold", "event", "K", "K", "event", "sync"]
+    assert device.calls == ["sync", "hold", "event", "K", "K", "event", "release", "sync"]
+
+
+def test_a_launch_that_waits_for_the_held_stream_is_an_error_and_not_a_time() -> None:
+    device = ScriptedDevice({"K": constant(0.001)}, hold_expired=True)
+    with pytest.raises(InputError, match="transfer cannot be timed"):
+        measure.sample_step(device, TRANSFER, "cold")
+
+
+def test_the_stream_is_let_go_when_a_launch_fails() -> None:
+    device = ScriptedDevice({"K": iter([])})
+    with pytest.raises(StopIteration):
+        measure.sample_step(device, TRANSFER, "cold")
+    assert device.calls[-1] == "release"
 
 
 def test_neither_flush_nor_hold_nor_reset_is_in_the_time() -> None:
@@ -176,7 +192,7 @@ def test_device_clock_moves_by_event_time_only() -> None:
 
 
 def test_order_of_calls_down_to_cupy(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same order, seen from the driver: flush, sync, (hold,) event, kernels, event, sync."""
+    """The same order, seen from the driver: flush, sync, hold, event, kernels, event, sync."""
     gpu = FakeGpu(seconds={"first": 0.001, "second": 0.002}, compile_for_real=False)
     monkeypatch.setitem(sys.modules, "cupy", fake_cupy(gpu))
     device = CudaDevice("cuda")
@@ -189,4 +205,5 @@ def test_order_of_calls_down_to_cupy(monkeypatch: pytest.MonkeyPatch) -> None:
     assert times["transfer"].samples == pytest.approx([0.003] * 3)
     said = [detail.name if what == "kernel" else what for what, detail in gpu.calls]
     one = ["first", "flush", "sync", "mpmbench_hold", "event", "first", "second", "event", "sync"]
-    assert said == one * 4
+    loading = ["mpmbench_hold", "mpmbench_stamp", "sync"]
+    assert said == [*one[:3], *loading, *one[3:], *one * 3]

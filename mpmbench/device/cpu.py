@@ -22,8 +22,8 @@ FLUSH_BYTES = 64 << 20  # where the size of the last cache is not known
 
 
 class CpuDevice(SimulatedDevice):
-    """Runs kernels on one core, without counting. Offers what timing needs: ``flush_cache``, ``hold``, ``record``,
-    ``elapsed``."""
+    """Runs kernels on one core, without counting. Offers what timing needs: ``flush_cache``, ``hold``, ``release``,
+    ``record``, ``elapsed``."""
 
     name = "cpu"
 
@@ -57,8 +57,13 @@ class CpuDevice(SimulatedDevice):
         """Evict the caches: overwrite a buffer of twice the last one's size."""
         self._flush_buffer[:] = 0
 
-    def hold(self, seconds: float) -> None:
+    hold_expired = False
+
+    def hold(self) -> None:
         """Nothing to hold: a launch runs when it is made."""
+
+    def release(self) -> None:
+        """Nothing is held."""
 
     def record(self) -> float:
         """This moment [s]."""

@@ -11,17 +11,21 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
+from functools import cached_property
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
 from mpmbench.device import CompiledKernel, KernelInfo, Launch, LaunchReport
+from mpmbench.device.cuda_timing import Stamp, StreamTimer
+from mpmbench.device.nvml import Nvml, hashed, visible_devices
 from mpmbench.device.ptxas import source_infos
 from mpmbench.errors import InputError
 from mpmbench.kernel import COMPILE_OPTIONS, KernelSource
 
+MAILBOX_BYTES = 8
 DEFAULT_SHARED_BYTES = 48 * 1024  # a kernel that wants more dynamic shared memory has to ask for it
 CURE_KERNEL = "run it on the device 'simulated' in its debug mode to find the cause; this process has lost the GPU"
 CURE_LAUNCH = "use another block shape or fewer threads per thread block"
@@ -29,22 +33,6 @@ CURE_NO_GPU = "run on a machine with an NVIDIA GPU and driver, or use the device
 
 # Options that CuPy appends to every compile, beside the architecture; given twice they only make its cache key differ.
 CUPY_APPENDS = ("-ftz=true", "-default-device")
-
-# Keeps the stream busy for a while. Python needs some 10 us per launch; without this the gap between the start event
-# and the kernel would be timed as well. The cycle count ends the loop should the global timer stand still: no GPU
-# clock exceeds 4 GHz.
-HOLD_SOURCE = r"""
-extern "C" __global__ void mpmbench_hold(unsigned long long nanoseconds)
-{
-    const long long first_cycle = clock64();
-    unsigned long long begin, now;
-    asm volatile("mov.u64 %0, %%globaltimer;" : "=l"(begin));
-    do {
-        asm volatile("mov.u64 %0, %%globaltimer;" : "=l"(now));
-    } while (now - begin < nanoseconds
-             && (unsigned long long)(clock64() - first_cycle) < 4 * nanoseconds);
-}
-"""
 
 
 def import_cupy() -> ModuleType:
@@ -67,7 +55,8 @@ def cupy_options(options: tuple[str, ...]) -> tuple[str, ...]:
 class CudaDevice:
     """One GPU. ``name`` is "cuda" (the first GPU) or "cuda:N"; it is "cuda:N" afterwards.
 
-    Besides the device protocol it offers what ``measure`` needs: ``flush_cache``, ``hold``, ``record``, ``elapsed``.
+    Besides the device protocol it offers what timing needs: ``flush_cache``, ``hold`` and ``release``, ``record`` and
+    ``elapsed``, ``stamp`` and ``clock_between``.
     """
 
     def __init__(self, name: str = "cuda", arch: str | None = None) -> None:
@@ -93,18 +82,20 @@ class CudaDevice:
             raise InputError(
                 f"{self.name} compiles for itself, {self.arch}, not for {arch}: leave the architecture out"
             )
-        self._hold_kernel: Any = None
         self._flush_buffer: Any = None
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What records keep of this GPU and of what runs on it."""
+        """What records keep of this GPU and of what runs on it; ``Nvml.facts`` tells the meaning of NVML's.
+
+        nvml_missing: why there are none of them. Facts whose names end in ``_now`` change from moment to moment.
+        """
         cuda, properties = self._cupy.cuda, self.properties
-        name, uuid = properties["name"], properties.get("uuid")
+        name = properties["name"]
         with self._errors("cannot ask for versions"):
-            return {
+            facts = {
                 "name": name.decode() if isinstance(name, bytes) else str(name),
-                "uuid": uuid.hex() if isinstance(uuid, bytes) else None,
+                "uuid": hashed(properties.get("uuid")),
                 "arch": self.arch,
                 "multiprocessors": properties["multiProcessorCount"],
                 "memory_bytes": properties["totalGlobalMem"],
@@ -114,9 +105,44 @@ class CudaDevice:
                 "memory_bus_bits": properties["memoryBusWidth"],
                 "ecc": bool(properties["ECCEnabled"]),
                 "cuda_driver": cuda.runtime.driverGetVersion(),
+                "cuda_runtime": cuda.runtime.runtimeGetVersion(),
                 "nvrtc": ".".join(map(str, cuda.nvrtc.getVersion())),
+                "nvrtc_options": " ".join(COMPILE_OPTIONS),
                 "cupy": self._cupy.__version__,
+                "visible_devices": visible_devices(),
             }
+        nvml, missing = self._nvml
+        if nvml is None:
+            return {**facts, "nvml_missing": missing}
+        told = nvml.facts()
+        return {**facts, **{key: value for key, value in told.items() if value is not None or key not in facts}}
+
+    @cached_property
+    def _nvml(self) -> tuple[Nvml | None, str]:
+        with self._errors("cannot ask for the PCI bus id"):
+            return Nvml.of(self.properties.get("uuid"), self._cupy.cuda.runtime.deviceGetPCIBusId(self._gpu.id))
+
+    def throttle_reasons(self) -> str:
+        """What holds the clocks down right now; "" for nothing, or where nobody tells."""
+        nvml, _ = self._nvml
+        return (nvml.throttle_reasons() or "") if nvml is not None else ""
+
+    def lock_clocks(self, spec: str) -> AbstractContextManager[None]:
+        """See ``Nvml.lock_clocks``; InputError where there is no NVML."""
+        nvml, missing = self._nvml
+        if nvml is None:
+            raise InputError(f"{self.name}: cannot lock the clocks: {missing}; see `mpmbench doctor`")
+        return nvml.lock_clocks(spec)
+
+    @property
+    def usual_hertz(self) -> float | None:
+        """SM clock that a GPU in good health has [Hz]: the one that this process locked, else the driver's; None where
+        neither is told."""
+        nvml, _ = self._nvml
+        if nvml is not None and nvml.locked:
+            megahertz = nvml.sm_clock  # a lock is a request: this is what came of it
+            return megahertz * 1e6 if megahertz else None
+        return self.properties["clockRate"] * 1e3 or None
 
     # Memory
 
@@ -213,13 +239,38 @@ class CudaDevice:
         with self._errors("cannot flush the cache"), self._current():
             self._flush_buffer.data.memset_async(0, size, stream=self._stream)
 
-    def hold(self, seconds: float) -> None:
-        """Keep the stream busy for about ``seconds`` while the host enqueues what comes next."""
-        with self._errors("cannot hold the stream"), self._current():
-            if self._hold_kernel is None:
-                module = self._cupy.RawModule(code=HOLD_SOURCE, options=cupy_options(COMPILE_OPTIONS))
-                self._hold_kernel = module.get_function("mpmbench_hold")
-            self._hold_kernel((1, 1, 1), (1, 1, 1), (np.uint64(round(seconds * 1e9)),), shared_mem=0)
+    @cached_property
+    def _timer(self) -> StreamTimer:
+        cuda = self._cupy.cuda
+        with self._errors("cannot map host memory"), self._current():
+            memory = cuda.PinnedMemory(MAILBOX_BYTES, cuda.runtime.hostAllocMapped)
+            pointer = cuda.PinnedMemoryPointer(memory, 0)
+        # Addresses are unified on every 64-bit system: kernels reach mapped host memory by the host's own address.
+        return StreamTimer(self, np.frombuffer(pointer, np.uint32), pointer.ptr)
+
+    def hold(self) -> None:
+        """Keep the stream from going on until ``release``, while the host enqueues what comes next.
+
+        Every kernel that is enqueued meanwhile must have run before: loading one waits for the stream.
+        """
+        self._timer.hold()
+
+    def release(self) -> None:
+        """Let a held stream go on."""
+        self._timer.release()
+
+    @property
+    def hold_expired(self) -> bool:
+        """Once the stream is done: whether the last hold ended by itself, so that the sample in it is worth nothing."""
+        return self._timer.expired
+
+    def stamp(self) -> Stamp:
+        """Read the clocks at this point of the stream."""
+        return self._timer.stamp()
+
+    def clock_between(self, first: Stamp, second: Stamp) -> float | None:
+        """SM clock between the last two stamps [Hz], once the stream is done; None where they caught no clock."""
+        return self._timer.clock_between(first, second)
 
     def record(self) -> Any:
         """A new event at this point of the stream."""
