@@ -44,6 +44,8 @@ class PeerCase:
     dataset: DatasetChoice
     axes: Mapping[str, Any]
 
+    search = None  # a peer has no axes to search
+
     @property
     def name(self) -> str:
         return self.peer.name
