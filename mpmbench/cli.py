@@ -144,7 +144,7 @@ def _choose(
     for name, values in map(_parse_axis, axes):
         if name in given:
             raise InputError(f"axis {name!r} is given twice: write {name}=[value,value]")
-        given[name] = values
+        given[name] = list(dict.fromkeys(values))
     known = {name for strategy in chosen for name in strategy.axes}
     if unknown := [name for name in given if name not in known]:
         raise InputError(f"unknown axis {unknown[0]!r}: valid are {', '.join(sorted(known))}")
@@ -159,7 +159,7 @@ def _choose(
             dx,
             origin,
         )
-        for name in datasets or ("uniform_cube",)
+        for name in dict.fromkeys(datasets or ("uniform_cube",))
     ]
     of_transfers = {name: values for name, values in given.items() if any(name in t.axes for t in transfers)}
     return [
@@ -439,6 +439,9 @@ def run(
     mpmbench run --dataset my_particles.npz -d cuda -a "cache=[cold,step]"
     mpmbench run --gpu h100,a100,rtx4090 --dataset my_particles.npz --html which_one.html
     """
+    from mpmbench.session import keeps_time
+    from mpmbench.session import shard as part
+
     caches, selection["axes"] = _cache_states(selection["axes"])
     cases = _choose(**selection, quick=quick, preset_name=preset_name, devices=devices)
     if quick and rigorous:
@@ -452,16 +455,16 @@ def run(
     if lock is not None:
         _refuse_lock(lock, devices, gpu_names)
     if gpu_names:
+        if shard is not None:
+            cases = part(cases, shard, together=False)
         _run_modelled(cases, gpu_names, devices, arch, outputs, resume, dry_run)
         return
     # The thesis measured a GTX 970: its rows are counted on the code that NVRTC makes for that GPU.
     opened = _open_devices(devices, arch or ("sm_52" if preset_name == "thesis" else None), "count")
     if tune is not None:
         opened = _that_keep_time(opened, named=bool(devices))
+    _refuse_unknown_baseline(cases, baseline)  # of all parts: only one of them has it
     if shard is not None:
-        from mpmbench.session import keeps_time
-        from mpmbench.session import shard as part
-
         cases = part(cases, shard, together=any(map(keeps_time, opened)))
     if dry_run:
         for device in opened:
@@ -472,7 +475,6 @@ def run(
         console.print(f"{len(cases) * len(opened)} rows")
         return
     timings = _timings(caches, quick, rigorous, baseline)
-    _refuse_unknown_baseline(cases, baseline)
     with _locked_clocks(opened, lock):
         _warn_of_gpus(opened)
         records = _run_cases(cases, opened, json_path, "append" if resume else "replace", timings)
@@ -686,12 +688,12 @@ def _run_cases(
 
     # SIGTERM ends a run as Ctrl-C does: the row in flight is lost, the others are on disk.
     signal.signal(signal.SIGTERM, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
-    known = read_records(json_path) if json_path is not None and existing == "append" and json_path.exists() else []
     refuse_bad_input(cases)
     total = sum(len(cases) * (max(1, len(timings)) if keeps_time(device) else 1) for device in devices)
     records: list[Any] = []
-    writer = RecordWriter(json_path, existing) if json_path else None
+    writer = RecordWriter(json_path, existing) if json_path else None  # before reading: from here on it is ours alone
     try:
+        known = read_records(json_path) if json_path and existing == "append" else []
         with _progress() as progress:
             task = progress.add_task("", total=total)
 
@@ -709,6 +711,9 @@ def _run_cases(
     finally:
         if writer:
             writer.close()
+    if known and (others := len(known) + (writer.rows if writer else 0) - len(records)):
+        notes.print(f"{json_path} holds {others} rows of other selections too: kept, and left out of what follows;"
+                    f" mpmbench report {json_path} shows all", markup=False, soft_wrap=True)  # fmt: skip
     return records
 
 
