@@ -1,4 +1,4 @@
-"""The command line: ``mpmbench list | run | check | profile | report | compare | verify | reproduce | doctor | ...``.
+"""The command line: ``mpmbench list | run | sweep | check | profile | report | compare | verify | doctor | ...``.
 
 Names and axis syntax follow NVBench. Exit codes: 0 ok, 1 harness error, 2 usage or bad input, 3 regression, 4 wrong
 results or findings, 130 interrupted.
@@ -219,6 +219,8 @@ def _timings(caches: Sequence[str], quick: bool, rigorous: bool, baseline: str) 
     from mpmbench.contest import Timing
     from mpmbench.protocol import rounds
 
+    if quick and rigorous:
+        raise InputError("--quick and --rigorous exclude each other: leave one of them out")
     rules = rounds.QUICK if quick else rounds.RIGOROUS if rigorous else rounds.Rules()
     sampling = measure.QUICK if quick else measure.Sampling()
     return [Timing(cache, rules, sampling, baseline) for cache in dict.fromkeys(caches)]
@@ -444,8 +446,7 @@ def run(
 
     caches, selection["axes"] = _cache_states(selection["axes"])
     cases = _choose(**selection, quick=quick, preset_name=preset_name, devices=devices)
-    if quick and rigorous:
-        raise InputError("--quick and --rigorous exclude each other: leave one of them out")
+    timings = _timings(caches, quick, rigorous, baseline)
     if resume and json_path is None:
         raise InputError("--resume needs --json FILE, the file whose rows it keeps")
     outputs = [json_path, html_path, md_path, csv_path, nvbench_path]
@@ -474,7 +475,7 @@ def run(
                 )
         console.print(f"{len(cases) * len(opened)} rows")
         return
-    timings = _timings(caches, quick, rigorous, baseline)
+    _terminate_like_ctrl_c()  # before clocks are locked: the lock has a handler of its own where there is none
     with _locked_clocks(opened, lock):
         _warn_of_gpus(opened)
         records = _run_cases(cases, opened, json_path, "append" if resume else "replace", timings)
@@ -686,8 +687,7 @@ def _run_cases(
     from mpmbench.runner import refuse_bad_input
     from mpmbench.session import keeps_time, run_session
 
-    # SIGTERM ends a run as Ctrl-C does: the row in flight is lost, the others are on disk.
-    signal.signal(signal.SIGTERM, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
+    _terminate_like_ctrl_c()
     refuse_bad_input(cases)
     total = sum(len(cases) * (max(1, len(timings)) if keeps_time(device) else 1) for device in devices)
     records: list[Any] = []
@@ -715,6 +715,13 @@ def _run_cases(
         notes.print(f"{json_path} holds {others} rows of other selections too: kept, and left out of what follows;"
                     f" mpmbench report {json_path} shows all", markup=False, soft_wrap=True)  # fmt: skip
     return records
+
+
+def _terminate_like_ctrl_c() -> None:
+    """SIGTERM ends a run as Ctrl-C does: the row in flight is lost, the others are on disk. A job manager that has its
+    own use for the signal keeps it."""
+    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
 
 
 def _progress() -> Progress:
@@ -823,7 +830,7 @@ def _summarise(records: list[Any], written: Sequence[Path]) -> None:
 
 
 # They add their commands, and need what stands above.
-from mpmbench import cli_compare, cli_profile, cli_sanitize  # noqa: E402, F401
+from mpmbench import cli_compare, cli_profile, cli_sanitize, cli_sweep  # noqa: E402, F401
 
 if __name__ == "__main__":
     main()
