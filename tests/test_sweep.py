@@ -316,7 +316,8 @@ def test_every_gpu_runs_every_case(tmp_path, gpus):
 
 def test_gpus_of_one_model_share_the_cases_out(tmp_path, gpus):
     out = tmp_path / "swept"
-    invoke("sweep", "--out", out, *PROBLEM, "--gpus", "0,1", "--split", code=1)
+    told = invoke("sweep", "--out", out, *PROBLEM, "--gpus", "0,1", "--split", code=1)
+    assert "with exit code" not in told  # parts made as many rows as were expected: contests were not torn apart
     assert Counter(keys(out / "rows.jsonl")).most_common(1)[0][1] == 1
     assert len(keys(out / "rows.jsonl")) == 6
     assert {r.environment.gpu["uuid"] for r in read_records(out / "rows.jsonl")} == {"0", "1"}
