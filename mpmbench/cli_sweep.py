@@ -137,10 +137,14 @@ def sweep(
     caches = [timing.cache for timing in cli._timings(caches, given["quick"], given["rigorous"], given["baseline"])]
     chosen = {name: given[name] for name in inspect.signature(cli._choose).parameters if name in given}
     cases = cli._choose(**chosen | {"axes": axes, "preset_name": given["preset_name"]})
+    if given["tune"] is not None:
+        cases = cli._to_search(cases, given["tune"], axes, given["preset_name"])
     cli._refuse_unknown_baseline(cases, given["baseline"])
     slots, models = _slots(executor, gpus, tuple(given["devices"]), workers, shards, len(cases))
     on_gpus = bool(models) or (executor == "slurm" and _wants_gpu(given["devices"]))
     devices = tuple(given["devices"]) or (("cuda",) if on_gpus else ("simulated",))
+    if given["tune"] is not None and "simulated" in devices:
+        raise InputError("--tune needs times: sweep GPUs, or -d cpu")
     if not each and len(set(models.values())) > 1:
         differing = ", ".join(f"{name} is {model}" for name, model in models.items())
         raise InputError(f"--split is for GPUs of one model ({differing}): use --each, or name equal ones with --gpus")

@@ -21,7 +21,7 @@ from typing import Any, Protocol
 from mpmbench.contest import baseline_of, contests
 from mpmbench.errors import InputError
 from mpmbench.record import Record, read_records
-from mpmbench.runner import Inputs, resume_key
+from mpmbench.runner import Inputs, tuned_key
 
 FINISHED = (0, 1, 4)  # exit codes of a run that came to its end, whatever it found
 STOP_SECONDS = 10.0  # that a part has to end after Ctrl-C
@@ -366,13 +366,13 @@ def merge(
     groups = list(dict.fromkeys(part.group for part in parts))
     for part in parts:
         for record in read_records(part.journal) if part.journal.exists() else []:
-            key = (part.group, resume_key(record), record.cache)
+            key = (part.group, tuned_key(record), record.cache)
             found.setdefault(key, record)
             sort[key] = (
                 groups.index(part.group),
                 list(devices).index(record.device.partition(":")[0]),
                 list(caches).index(record.cache) if record.cache is not None else 0,
-                place[record.cache is not None][_anywhere(resume_key(record))],
+                place[record.cache is not None].get(_anywhere(tuned_key(record)), len(cases)),
             )
     return [found[key] for key in sorted(found, key=lambda key: sort[key])]
 

@@ -20,6 +20,7 @@ from submitit.slurm.slurm import SlurmExecutor
 from mpmbench import cli_sweep, sweep
 from mpmbench.cli import main
 from mpmbench.cli import run as run_command
+from mpmbench.protocol import rounds
 from mpmbench.record import RecordWriter, read_records
 from mpmbench.runner import resume_key
 from mpmbench.sweep import Outcome, Part, Slot, Submitted, run_parts
@@ -28,6 +29,7 @@ PROBLEM = ["--particles", "60", "--grid-shape", "12x12x12", "--quick", "-b", "p2
            "--dataset", "random", "--dataset", "uniform_cube"]  # fmt: skip
 COUNTED = [*PROBLEM, "-d", "simulated"]
 MODEL = "NVIDIA H100"
+BRIEF = rounds.Rules(passes=2, min_rounds=2, max_rounds=2, time_limit=0.1, warmup_seconds=0.0, warmup_limit=0.0)
 
 
 def invoke(*words: object, code: int = 0) -> str:
@@ -369,6 +371,19 @@ def test_wall_clock_has_no_neighbours(tmp_path):
     told = invoke(*words, "--shards", "2")
     assert "2 parts, 12 rows" in told
     assert told.count("on worker0:") == 2
+
+
+def test_searched_rows_are_merged_in_order(tmp_path, in_process, monkeypatch):
+    monkeypatch.setattr(rounds, "QUICK", BRIEF)
+    brief = ["--particles", "60", "--grid-shape", "12x12x12", "--quick", "-b", "p2g_global_atomic",
+             "-b", "p2g_block_sync",
+             "-a", "batching=1", "-a", "cache=hot", "-d", "cpu", "--tune", "2"]  # fmt: skip
+    out = tmp_path / "swept"
+    invoke("sweep", "--out", out, *brief)
+    rows = read_records(out / "rows.jsonl")
+    assert [row.variant for row in rows] == ["p2g_global_atomic", "p2g_block_sync"]
+    assert rows[1].tuning.budget == 2
+    assert "--tune needs times" in refusal("sweep", "--out", out, *PROBLEM, "-d", "simulated", "--tune", "2")
 
 
 # --- SLURM ------------------------------------------------------------------------------------------------------------
