@@ -1,4 +1,4 @@
-"""The command line: ``mpmbench list | run | check | profile | report | compare | verify | reproduce | doctor | ...``.
+"""The command line: ``mpmbench list | run | sweep | check | profile | report | compare | verify | doctor | ...``.
 
 Names and axis syntax follow NVBench. Exit codes: 0 ok, 1 harness error, 2 usage or bad input, 3 regression, 4 wrong
 results or findings, 130 interrupted.
@@ -144,7 +144,7 @@ def _choose(
     for name, values in map(_parse_axis, axes):
         if name in given:
             raise InputError(f"axis {name!r} is given twice: write {name}=[value,value]")
-        given[name] = values
+        given[name] = list(dict.fromkeys(values))
     known = {name for strategy in chosen for name in strategy.axes}
     if unknown := [name for name in given if name not in known]:
         raise InputError(f"unknown axis {unknown[0]!r}: valid are {', '.join(sorted(known))}")
@@ -159,7 +159,7 @@ def _choose(
             dx,
             origin,
         )
-        for name in datasets or ("uniform_cube",)
+        for name in dict.fromkeys(datasets or ("uniform_cube",))
     ]
     of_transfers = {name: values for name, values in given.items() if any(name in t.axes for t in transfers)}
     return [
@@ -219,6 +219,8 @@ def _timings(caches: Sequence[str], quick: bool, rigorous: bool, baseline: str) 
     from mpmbench.contest import Timing
     from mpmbench.protocol import rounds
 
+    if quick and rigorous:
+        raise InputError("--quick and --rigorous exclude each other: leave one of them out")
     rules = rounds.QUICK if quick else rounds.RIGOROUS if rigorous else rounds.Rules()
     sampling = measure.QUICK if quick else measure.Sampling()
     return [Timing(cache, rules, sampling, baseline) for cache in dict.fromkeys(caches)]
@@ -439,10 +441,12 @@ def run(
     mpmbench run --dataset my_particles.npz -d cuda -a "cache=[cold,step]"
     mpmbench run --gpu h100,a100,rtx4090 --dataset my_particles.npz --html which_one.html
     """
+    from mpmbench.session import keeps_time
+    from mpmbench.session import shard as part
+
     caches, selection["axes"] = _cache_states(selection["axes"])
     cases = _choose(**selection, quick=quick, preset_name=preset_name, devices=devices)
-    if quick and rigorous:
-        raise InputError("--quick and --rigorous exclude each other: leave one of them out")
+    timings = _timings(caches, quick, rigorous, baseline)
     if resume and json_path is None:
         raise InputError("--resume needs --json FILE, the file whose rows it keeps")
     outputs = [json_path, html_path, md_path, csv_path, nvbench_path]
@@ -452,16 +456,16 @@ def run(
     if lock is not None:
         _refuse_lock(lock, devices, gpu_names)
     if gpu_names:
+        if shard is not None:
+            cases = part(cases, shard, together=False)
         _run_modelled(cases, gpu_names, devices, arch, outputs, resume, dry_run)
         return
     # The thesis measured a GTX 970: its rows are counted on the code that NVRTC makes for that GPU.
     opened = _open_devices(devices, arch or ("sm_52" if preset_name == "thesis" else None), "count")
     if tune is not None:
         opened = _that_keep_time(opened, named=bool(devices))
+    _refuse_unknown_baseline(cases, baseline)  # of all parts: only one of them has it
     if shard is not None:
-        from mpmbench.session import keeps_time
-        from mpmbench.session import shard as part
-
         cases = part(cases, shard, together=any(map(keeps_time, opened)))
     if dry_run:
         for device in opened:
@@ -471,8 +475,7 @@ def run(
                 )
         console.print(f"{len(cases) * len(opened)} rows")
         return
-    timings = _timings(caches, quick, rigorous, baseline)
-    _refuse_unknown_baseline(cases, baseline)
+    _terminate_like_ctrl_c()  # before clocks are locked: the lock has a handler of its own where there is none
     with _locked_clocks(opened, lock):
         _warn_of_gpus(opened)
         records = _run_cases(cases, opened, json_path, "append" if resume else "replace", timings)
@@ -684,14 +687,13 @@ def _run_cases(
     from mpmbench.runner import refuse_bad_input
     from mpmbench.session import keeps_time, run_session
 
-    # SIGTERM ends a run as Ctrl-C does: the row in flight is lost, the others are on disk.
-    signal.signal(signal.SIGTERM, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
-    known = read_records(json_path) if json_path is not None and existing == "append" and json_path.exists() else []
+    _terminate_like_ctrl_c()
     refuse_bad_input(cases)
     total = sum(len(cases) * (max(1, len(timings)) if keeps_time(device) else 1) for device in devices)
     records: list[Any] = []
-    writer = RecordWriter(json_path, existing) if json_path else None
+    writer = RecordWriter(json_path, existing) if json_path else None  # before reading: from here on it is ours alone
     try:
+        known = read_records(json_path) if json_path and existing == "append" else []
         with _progress() as progress:
             task = progress.add_task("", total=total)
 
@@ -709,7 +711,17 @@ def _run_cases(
     finally:
         if writer:
             writer.close()
+    if known and (others := len(known) + (writer.rows if writer else 0) - len(records)):
+        notes.print(f"{json_path} holds {others} rows of other selections too: kept, and left out of what follows;"
+                    f" mpmbench report {json_path} shows all", markup=False, soft_wrap=True)  # fmt: skip
     return records
+
+
+def _terminate_like_ctrl_c() -> None:
+    """SIGTERM ends a run as Ctrl-C does: the row in flight is lost, the others are on disk. A job manager that has its
+    own use for the signal keeps it."""
+    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
 
 
 def _progress() -> Progress:
@@ -818,7 +830,7 @@ def _summarise(records: list[Any], written: Sequence[Path]) -> None:
 
 
 # They add their commands, and need what stands above.
-from mpmbench import cli_compare, cli_profile, cli_sanitize  # noqa: E402, F401
+from mpmbench import cli_compare, cli_profile, cli_sanitize, cli_sweep  # noqa: E402, F401
 
 if __name__ == "__main__":
     main()

@@ -108,9 +108,9 @@ def model_cases(cases: Sequence[Any], gpus: Sequence[Gpu], json_path: Path | Non
     from mpmbench.record import RecordWriter, read_records
     from mpmbench.tuning import model_tuned
 
-    known = read_records(json_path) if resume and json_path is not None and json_path.exists() else []
     writer = RecordWriter(json_path, "append" if resume else "replace") if json_path else None
     try:
+        known = read_records(json_path) if resume and json_path else []
         with _progress() as progress:
             keep = writer.write if writer else lambda record: None
             model = model_tuned if any(case.search for case in cases) else profile_cases

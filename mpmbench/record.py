@@ -7,6 +7,8 @@ Nothing that reads records needs a device, so any report can be rebuilt anywhere
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import math
 import os
@@ -473,6 +475,7 @@ class RecordWriter:
 
     existing: what to do with a file that is already there: "refuse" it, "append" after its last whole row, or
     "replace" it, which happens only when the first row is on disk.
+    A file has one writer at a time: a second one, in whatever process, is an InputError.
     """
 
     def __init__(self, path: str | Path, existing: Literal["refuse", "append", "replace"] = "refuse") -> None:
@@ -485,10 +488,19 @@ class RecordWriter:
             self._fd = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o644)  # now, not after an hour of work
         except OSError as error:
             raise InputError(f"cannot write records to {self.path}: {_reason(error)}") from None
+        if not _lock(self._fd, self.path):
+            self.close()
+            raise InputError(
+                f"{self.path} is being written by another process: wait until it ends, or name another file"
+            )
         self._replace = existing == "replace"
         self._end = 0  # bytes of whole rows
         if existing == "append":
-            self._end = self._whole_rows()
+            try:
+                self._end = self._whole_rows()
+            except InputError:
+                self.close()
+                raise
 
     def _whole_rows(self) -> int:
         """Length of the file without a torn last row; a last row that only lacks its newline gets it."""
@@ -515,6 +527,10 @@ class RecordWriter:
                 self._start_over(row)
             else:
                 _put(self._fd, row, self._end)
+        except KeyboardInterrupt:
+            if not self._replace and os.fstat(self._fd).st_size < self._end + len(row):
+                os.ftruncate(self._fd, self._end)
+            raise
         except OSError as error:
             if not self._replace:
                 os.ftruncate(self._fd, self._end)  # a shorter file needs no space: earlier rows stay whole
@@ -531,11 +547,12 @@ class RecordWriter:
         beside = target.with_name(f".{target.name}.new")
         new = os.open(beside, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
         try:
+            _lock(new, beside)
             _put(new, row, 0)
             beside.replace(target)
-        except OSError:
+        except BaseException:
             os.close(new)
-            beside.unlink()
+            beside.unlink(missing_ok=True)
             raise
         os.close(self._fd)
         self._fd, self._replace = new, False
@@ -552,6 +569,19 @@ class RecordWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _lock(fd: int, path: Path) -> bool:
+    """Take the file for as long as ``fd`` is open; False where somebody else has it, or has just put another file in
+    its place. The lock goes with the open file: a process that is killed leaves none behind."""
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        return error.errno not in (errno.EWOULDBLOCK, errno.EACCES)  # some network file systems have no locks
+    try:
+        return os.path.samestat(os.fstat(fd), os.stat(path))
+    except OSError:
+        return False
 
 
 def _put(fd: int, data: bytes, offset: int) -> None:

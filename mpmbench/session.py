@@ -31,10 +31,14 @@ def run_session(
     """Each record with whether it is new, device by device.
 
     timings: one for each cache state that is asked for; none: results are checked and nothing is timed.
-    known: rows of an earlier run, taken as they are.
+    known: rows of an earlier run, taken as they are; those of another GPU, cache state or case are passed over.
     """
     environment, inputs = Environment.capture(), Inputs()
-    kept = {(key(record), record.cache): record for record in known for key in (resume_key, tuned_key)}
+    kept = {
+        (key(record), record.cache, record.environment.gpu.get("name")): record
+        for record in known
+        for key in (resume_key, tuned_key)
+    }
     for device in devices:
         if not (timings and keeps_time(device)):
             yield from _one_by_one(cases, device, inputs, environment, kept, tick)
@@ -57,12 +61,18 @@ def shard(cases: Sequence[Any], text: str, together: bool) -> list[Any]:
     return [case for group in groups[int(part) - 1 :: int(parts)] for case in group]
 
 
+def _gpu_name(device: Any) -> str | None:
+    """Its model. Two cards of one model go on with each other's rows: on a cluster nobody chooses the card."""
+    name: str | None = getattr(device, "facts", {}).get("name")
+    return name
+
+
 def _one_by_one(
     cases: Sequence[Any], device: Any, inputs: Inputs, environment: Environment, kept: dict[Any, Record], tick: Tick
 ) -> Iterator[tuple[Record, bool]]:
     for case in cases:
         tick(f"{device.name} {case.title}")
-        record = kept.get((case.resume_key(device, inputs), None)) if kept else None
+        record = kept.get((case.resume_key(device, inputs), None, _gpu_name(device))) if kept else None
         yield (case.run(device, inputs, environment), True) if record is None else (record, False)
 
 
@@ -78,7 +88,7 @@ def _contest(
     ready, known = [], []
     told = f"{device.name} {timing.cache}"
     for case in group:
-        record = kept.get((case.resume_key(device, inputs), timing.cache)) if kept else None
+        record = kept.get((case.resume_key(device, inputs), timing.cache, _gpu_name(device))) if kept else None
         if record is not None:
             known.append(settled(case, record) if case.search else case)
             yield record, False
