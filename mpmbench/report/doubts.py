@@ -25,7 +25,7 @@ TOO_NOISY = 0.25
 NAMED = 5
 
 # Options of a run that say where its results go: a second run must not write over them.
-_TARGETS = ("--json", "--html", "--md", "--csv")
+_TARGETS = ("--json", "--html", "--md", "--csv", "--nvbench")
 _DROPPED = ("--quick", "--resume", "--dry-run", "--rigorous")
 
 
