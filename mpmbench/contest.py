@@ -201,6 +201,7 @@ def _record(contender: Contender, contest: Contest, name: str, device: Any, timi
             contest.stopped_by,
             tuple(contest.hertz[label]),
             contest.discarded,
+            contest.held_down,
         )
         about["comparison"] = _comparison(label, contest, name, timing.rules)
         about["repeat"] = _repeat(contender, device)

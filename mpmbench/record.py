@@ -49,7 +49,8 @@ class Measurement:
     samples: [s], every one that was kept, in the order taken.  mode: state of the caches before each sample: "cold"
     (overwritten), "hot" (a run of the same before it) or "step" (what the step of a simulation leaves there).
     stopped_by: why sampling ended, e.g. "verdict", "precision", "time limit".  hertz: clock of the processor during
-    each sample, empty where it is not known.  discarded: samples that were thrown away, by reason.
+    each sample, empty where it is not known.  discarded: samples that were thrown away, by reason.  held_down: rounds
+    at whose end the driver held the clocks down, by its reason.
     """
 
     samples: tuple[float, ...]
@@ -58,6 +59,7 @@ class Measurement:
     stopped_by: str
     hertz: tuple[float, ...] = ()
     discarded: Mapping[str, int] = field(default_factory=dict)
+    held_down: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.samples or not all(math.isfinite(s) and s >= 0 for s in self.samples):

@@ -507,6 +507,38 @@ def test_discarded_samples_are_told_once_per_contest():
     assert each.text.count(" on random") >= 5
 
 
+def test_a_gpu_that_was_held_down_says_how_often():
+    def held(rounds: int) -> list[Record]:
+        return [
+            replace(r, transfer_measurement=replace(r.transfer_measurement, held_down={"power cap": rounds}))
+            if r.transfer_measurement
+            else r
+            for r in everyday()
+        ]
+
+    (often,) = attention(held(30), "held the clocks down in 30 of 60 rounds (power cap)")
+    assert often.level == "warning"
+    assert "speedups stand" in often.action
+    (seldom,) = attention(held(1), "held the clocks down in 1 of 60 rounds")
+    assert seldom.level == "note"
+
+
+def test_a_working_set_that_the_cache_holds_is_noted():
+    small = [replace(r, floor_bytes=8 << 20) for r in on_gpu(everyday(), "Test GPU", l2_bytes=4 << 20)]
+    (note,) = attention(small, "Particles and nodes are 2 times the second-level cache")
+    assert "cache=[cold,hot,step]" in note.action
+    assert not attention([replace(r, floor_bytes=20 << 20) for r in small], "second-level cache")
+
+
+def test_compulsory_bytes_are_set_beside_the_peak_rate():
+    facts = {"memory_clock_khz": 3_505_000, "memory_bus_bits": 256}  # 224.32 GB/s
+    records = [replace(r, floor_bytes=200_000_000) for r in on_gpu(everyday(), "Test GPU", **facts)]
+    (first, *_) = column(measured.ranking(group(records)), "of peak")
+    best = min(r.transfer_measurement.median for r in records if r.transfer_measurement)
+    assert first == pytest.approx(200e6 / best / 224.32e9)
+    assert "of peak" not in [c.title for c in measured.ranking(group(everyday())).columns]
+
+
 def test_rows_whose_clock_differs_are_not_compared():
     records = everyday(megahertz=(1755, 1755, 1600, 1755, 1755, 1755))
     (apart,) = attention(records, "Clocks differ by more than 1 %")

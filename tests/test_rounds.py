@@ -243,6 +243,13 @@ def test_a_throttled_baseline_ends_it() -> None:
     assert contest.spoiled.keys() == {"a"}
 
 
+def test_rounds_that_are_held_down_are_counted_by_reason() -> None:
+    clock = Tape()
+    reasons = iter(["", "power cap", "power cap"])
+    clock.trouble = lambda: next(reasons)  # type: ignore[method-assign]
+    assert run_rounds(arms("a", "b"), clock, COLD_START).held_down == {"power cap": 2}
+
+
 def test_arms_under_different_clocks_are_not_compared() -> None:
     hertz = {"a": 1.5e9, "b": 1.45e9, "c": 1.499e9}
 

@@ -104,7 +104,8 @@ class Contest:
     seconds: name -> times [s] of the passes that count, aligned between arms.  hertz: name -> clocks of the same
     samples, empty where the clock of the processor is not known.  paired: name -> against the baseline, corrected for
     the number of arms; not for the baseline itself.  leaders: arms that no other was found to beat.
-    noise: ratio of the two copies of the baseline.  discarded: passes thrown away, by reason.
+    noise: ratio of the two copies of the baseline.  discarded: passes thrown away, by reason.  held_down: rounds at
+    whose end something slowed the processor, by what it was.
     spoiled: arm -> why it has no time.
     """
 
@@ -120,6 +121,7 @@ class Contest:
     seed: int
     stopped_by: str
     discarded: dict[str, int]
+    held_down: dict[str, int]
     spoiled: dict[str, str]
 
 
@@ -167,6 +169,7 @@ class _Rounds:
         self.seconds: list[list[float]] = [[] for _ in self.arms]
         self.hertz: list[list[float]] = [[] for _ in self.arms]
         self.discarded: dict[str, int] = {}
+        self.held_down: dict[str, int] = {}
         self.spoiled: dict[int, str] = {}
         self.random = random.Random(seed)
 
@@ -182,6 +185,8 @@ class _Rounds:
                 self._pass(order)
                 self._pass(order[::-1])
             rounds += 1
+            if why := self.clock.trouble():
+                self.held_down[why] = self.held_down.get(why, 0) + 1
             late = "time limit" if self.clock.now() - begin >= limit else ""
             last = late or ("round limit" if rounds >= rules.max_rounds else "") or self._unusable()
             if last or rounds == schedule[look]:
@@ -304,6 +309,7 @@ class _Rounds:
             seed=self.seed,
             stopped_by=stopped_by,
             discarded=dict(self.discarded),
+            held_down=dict(self.held_down),
             spoiled={names[place]: why for place, why in self.spoiled.items()},
         )
 

@@ -250,7 +250,8 @@ def _answer(groups: Sequence[Group], on_gpus: Sequence[GpuGroup], kinds: set[Kin
     elif kinds == {Kind.SIMULATED}:
         sentences.append(
             "No GPU took part: every cost below is counted on a simulated device, exactly, and is not time. "
-            "Run the same command where there is a GPU for times and speedups."
+            "Run the same command where there is a GPU for times and speedups, or with --gpu h100,a100,gtx970 for "
+            "times modelled for GPUs that you name."
         )
     elif Kind.MEASURED not in kinds:
         sentences.append("No GPU took part: times are wall clock on a CPU, and say nothing about a GPU.")

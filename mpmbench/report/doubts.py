@@ -22,6 +22,8 @@ from mpmbench.report.text import interval_text, seconds_text
 
 NOISY = 0.10  # interquartile range over median
 TOO_NOISY = 0.25
+OFTEN = 0.05  # share of rounds
+CACHE_BOUND = 5  # below so many times the cache, cold and hot caches have been seen to rank differently
 NAMED = 5
 
 # Options of a run that say where its results go: a second run must not write over them.
@@ -87,6 +89,14 @@ def _of_contest(g: Group) -> Iterator[Doubt]:
     if any(t.discarded for _, _, t in rows):
         # A pass is thrown away as a whole, so that every row of the contest carries the same numbers.
         yield _discarded(first, max((t for _, _, t in rows), key=lambda t: sum(t.discarded.values())), g.title)
+    for why, count in max((t.held_down for _, _, t in rows), key=len).items():
+        trouble = f"The driver held the clocks down in {count:,} of {comparison.rounds:,} rounds ({why})"
+        action = f"All rows of a round were held down alike, so speedups stand; for the times, {_cool(first)}."
+        yield Doubt("warning" if count > comparison.rounds * OFTEN else "note", trouble, action, g.title)
+    if (ratio := _cache_share(first)) is not None and ratio < CACHE_BOUND:
+        trouble = f"Particles and nodes are {ratio:.2g} times the second-level cache: its state can decide the ranking"
+        action = 'Rank by the state that the simulation has: `-a "cache=[cold,hot,step]"` shows all three.'
+        yield Doubt("note", trouble, action, g.title)
     if not any(c.is_baseline or c.speedup for _, c, _ in rows):
         action = "Find out why it failed (its row says), then run again."
         yield Doubt("warning", f"The baseline {comparison.baseline} has no time: nothing is compared", action, g.title)
@@ -174,6 +184,12 @@ def _cool(record: Record) -> str:
 
 def _clocks_locked(record: Record) -> bool:
     return any(word.startswith("--lock-gpu-clocks") for word in record.environment.argv)
+
+
+def _cache_share(record: Record) -> float | None:
+    """Working set of the plainest transfer over the second-level cache; None where either is not known."""
+    size = record.environment.gpu.get("l2_bytes")
+    return record.floor_bytes / size if size and record.floor_bytes else None
 
 
 def _clocks_differ(one: Measurement, other: Measurement) -> bool:

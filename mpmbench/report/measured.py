@@ -69,6 +69,8 @@ def ranking(g: Group) -> Table:
         timed("particles / s", of_time(lambda r, t: r.dataset.n / t), Quantity.RATE, "more", "throughput"),
         timed("ns / node visit", of_time(lambda r, t: 1e9 * t / r.node_visits), Quantity.NUMBER, "less",
               "time per pair of particle and node in its support"),
+        timed("of peak", of_time(_of_peak), Quantity.SHARE, None,
+              "compulsory bytes (each particle and touched node once) over time, as a share of the DRAM's peak rate"),
         timed("noise", lambda r: r.transfer_measurement and r.transfer_measurement.noise, Quantity.SHARE, None,
               "interquartile range over median"),
         timed("least", lambda r: r.transfer_measurement and min(r.transfer_measurement.samples), Quantity.SECONDS,
@@ -88,6 +90,16 @@ def ranking(g: Group) -> Table:
     title = f"Ranking by {clock}{caches}. {g.title}"
     notes = [*_how_compared(g), *_other_caches(g), *tables.baseline_note(base, g)]
     return tables._table(title, sources, g.records, base, notes, g.shared, lambda r: mark(g, r))
+
+
+def _of_peak(record: Record, seconds: float) -> float | None:
+    """Share of DRAM's peak rate that the compulsory traffic alone takes: no transfer from cold caches passes 1."""
+    gpu = record.environment.gpu
+    clock, bits = gpu.get("memory_clock_khz"), gpu.get("memory_bus_bits")
+    if not (clock and bits and record.floor_bytes):
+        return None
+    peak = 2 * clock * 1e3 * bits / 8  # two transfers per clock, as the driver counts it
+    return record.floor_bytes / seconds / peak
 
 
 def mark(g: Group, record: Record) -> str:
