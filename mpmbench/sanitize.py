@@ -19,7 +19,7 @@ from mpmbench.environment import Environment
 from mpmbench.errors import InputError, MpmbenchError
 from mpmbench.kernel import load_source
 from mpmbench.launch_file import ArraySpec, LaunchFile, LaunchSpec
-from mpmbench.runner import Inputs, run_case
+from mpmbench.runner import Inputs
 from mpmbench.simt.counters import ERROR, INFO, WARNING, Finding
 
 SEEDS = 3  # schedules that are tried
@@ -121,10 +121,7 @@ def sanitize_cases(
         passed = []
         for seed in range(seeds):
             device = _Watched(arch, seed, budget)
-            if hasattr(case, "primitive"):
-                record = case.run(device, environment)
-            else:
-                record = run_case(case, device, inputs, environment)
+            record = case.run(device, inputs, environment)
             result.add(device.seen)
             if record.failed_because:
                 raise MpmbenchError(f"{case.title}: {record.failed_because}")

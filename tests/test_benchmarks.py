@@ -113,7 +113,7 @@ def contest(**seconds):
     """What rounds of these samples come to, the first being the baseline."""
     first = next(iter(seconds))
     return Contest(first, seconds, {}, [2 * s for s in seconds[first]], {}, (), Interval(1, 1, 1), 2, 0, 0, "verdict",
-                   {"core taken": 3}, {"peer_taichi_p2g": "THROTTLED"})  # fmt: skip
+                   {"core taken": 3}, {}, {"peer_taichi_p2g": "THROTTLED"})  # fmt: skip
 
 
 def test_ratios_are_the_engine_over_each_peer_pass_by_pass(monkeypatch):

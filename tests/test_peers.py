@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import itertools
 import json
@@ -9,6 +10,7 @@ import os
 import subprocess
 import sys
 import weakref
+from ctypes.util import find_library
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -191,6 +193,24 @@ def test_libraries_say_nothing(capfd: pytest.CaptureFixture[str]) -> None:
     print("afterwards", file=sys.stderr)
     written = capfd.readouterr()
     assert (written.out, written.err) == ("", "afterwards\n")
+
+
+def test_libraries_leave_the_arithmetic_as_it_was() -> None:
+    """Taichi sets these two bits of MXCSR; whatever ran after it lost its denormals."""
+
+    class Flushing(Slow):
+        def __init__(self) -> None:
+            libm, state = ctypes.CDLL(find_library("m")), ctypes.create_string_buffer(64)
+            libm.fegetenv(state)
+            control = int.from_bytes(state.raw[28:32], "little") | 0x8040
+            libm.fesetenv(ctypes.create_string_buffer(state.raw[:28] + control.to_bytes(4, "little"), 64))
+            assert half_of_a_denormal() == 0
+
+    def half_of_a_denormal() -> float:
+        return float((np.array([1e-39], np.float32) * np.float32(0.5))[0])
+
+    open_library(library(Flushing, "flushing"))
+    assert half_of_a_denormal() > 0
 
 
 # --- rows -------------------------------------------------------------------------------------------------------------

@@ -6,11 +6,13 @@ Each module of this package holds one ``LIBRARY``; a ``Peer`` is one transfer of
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import os
 import pkgutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
+from ctypes.util import find_library
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata
@@ -119,7 +121,7 @@ def open_library(library: Library) -> Transfers:
     if not library.installed:
         raise PeerMissing(f"{library.title} is not installed: {INSTALL}")
     try:
-        with _silenced():
+        with _silenced(), _same_arithmetic():
             return library.open()
     except PeerMissing:
         raise
@@ -139,6 +141,18 @@ def _silenced() -> Iterator[None]:
         finally:
             os.dup2(kept, 2)
             os.close(kept)
+
+
+@contextmanager
+def _same_arithmetic() -> Iterator[None]:
+    """Taichi leaves the thread that starts it flushing denormals to zero: whatever runs next would round otherwise."""
+    libm = ctypes.CDLL(find_library("m"))
+    kept = ctypes.create_string_buffer(64)  # fenv_t, with room to spare
+    libm.fegetenv(kept)
+    try:
+        yield
+    finally:
+        libm.fesetenv(kept)
 
 
 def discover() -> tuple[Peer, ...]:
