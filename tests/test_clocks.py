@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import sys
 from dataclasses import dataclass, field, replace
-from itertools import cycle, pairwise
+from itertools import cycle
 
 import numpy as np
 import pynvml
@@ -194,16 +194,7 @@ def test_a_sample_that_lost_its_core_is_discarded(
     sample = WallClock(Cpu(), "step").sample(Arm("arm", lambda: None, lambda: None))
     assert sample.seconds == wall
     assert bool(sample.discard) is lost
-
-
-def test_on_a_machine_that_is_always_busy_two_samples_of_three_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    walls, processors = cycle([0.0, 1.0]), cycle([0.0, 0.5])
-    monkeypatch.setattr("time.perf_counter", lambda: next(walls))
-    monkeypatch.setattr("time.process_time", lambda: next(processors))
-    clock = WallClock(Cpu(), "step")
-    discarded = [bool(clock.sample(Arm("arm", lambda: None, lambda: None)).discard) for _ in range(300)]
-    assert sum(discarded) == 100
-    assert not any(a and b for a, b in pairwise(discarded[3:])), "no arm loses many in a row"
+    assert sample.tolerable, "a machine that is always busy has times too"
 
 
 def test_the_cpu_device_has_the_wall_clock() -> None:

@@ -226,6 +226,14 @@ def test_pauses_grow() -> None:
     assert clock.paused == pytest.approx([0.05, 0.1, 0.15, 0.2])
 
 
+def test_what_is_tolerable_is_kept_where_repeating_does_not_help() -> None:
+    clock = Tape(lambda name, n: Sample(1.0, discard="core taken", tolerable=True))
+    contest = run_rounds(arms("a", "b"), clock, COLD_START)
+    assert contest.spoiled == {}
+    assert contest.discarded == {"core taken": 3 * 12}, "each pass is repeated three times first"
+    assert len(contest.seconds["b"]) == 12
+
+
 def test_an_arm_that_is_always_throttled_is_given_up_and_the_others_go_on() -> None:
     clock = Tape(lambda name, n: Sample(1.0, discard="slow clock" if name == "b" and n > 3 else ""))
     clock.reasons = "power cap"

@@ -22,6 +22,7 @@ from mpmbench.protocol.verdict import CONFIDENCE, MARGIN, Interval, Paired, Verd
 
 CLOCKS_AGREE = 0.01  # arms whose median SM clocks differ by more are not compared
 PAUSE = 0.05  # [s] after a discarded pass, growing by as much each time
+MOST_TOLERABLE = 3  # times that a pass is repeated for something tolerable
 MOST_DISCARDED = 20  # passes in a row, then the arm that spoils them is given up
 
 
@@ -40,11 +41,13 @@ class Arm:
 
 
 class Sample(NamedTuple):
-    """seconds: of one run.  hertz: clock of the processor meanwhile, where known.  discard: why not to use it."""
+    """seconds: of one run.  hertz: clock of the processor meanwhile, where known.  discard: why not to use it.
+    tolerable: use it all the same where repeating the pass does not help."""
 
     seconds: float
     hertz: float | None = None
     discard: str = ""
+    tolerable: bool = False
 
 
 class Clock(Protocol):
@@ -215,20 +218,21 @@ class _Rounds:
         nothing."""
         sample, arms, spoiled = self.clock.sample, self.arms, self.spoiled
         blamed: dict[int, int] = {}
+        tries = 0
         while True:
             taken: list[tuple[int, Sample]] = []
             for place in order:
                 if place in spoiled:
                     continue
                 one = sample(arms[place])
-                if one.discard:
+                if one.discard and not (one.tolerable and tries >= MOST_TOLERABLE):
                     break
                 taken.append((place, one))
             else:
                 break
             blamed[place] = blamed.get(place, 0) + 1
             self.discarded[one.discard] = self.discarded.get(one.discard, 0) + 1
-            tries = sum(blamed.values())
+            tries += 1
             self.clock.pause(PAUSE * tries)
             if tries % MOST_DISCARDED == 0:
                 self._give_up(max(blamed, key=lambda place: blamed[place]), one.discard, tries)
