@@ -11,17 +11,19 @@ from mpmbench.simt.codegen import generate
 from mpmbench.simt.codegen_memory import MOST_GATHERS
 
 
-def straight(loads: int) -> str:
-    """A kernel whose one long piece of code holds this many 8-byte loads from shared memory."""
-    terms = "".join(f"a = fma(a, s[5 * t + {7 * number}], 1.0);" for number in range(loads))
+def straight(loads: int, pairs: bool = False) -> str:
+    """A kernel whose one long piece of code holds this many loads from shared memory, of 8 bytes or of 16."""
+    term = "a = fma(a, pairs[t + {0}].x, pairs[t + {0}].y);" if pairs else "a = fma(a, s[5 * t + {0}], 1.0);"
+    terms = "".join(term.format(7 * number) for number in range(loads))
     return f"""extern "C" __global__ void kernel(double* o) {{
-        __shared__ double s[6000];
+        __shared__ __align__(16) double s[6000];
+        const double2* pairs = reinterpret_cast<double2*>(s);
         int t = threadIdx.x; s[t] = o[t]; __syncthreads();
         double a = 0; {terms} o[t] = a; }}"""
 
 
-def llvm_text(loads: int, mode: str) -> str:
-    text = nvrtc.compile_cuda(straight(loads), "sm_70", OPTIONS)
+def llvm_text(loads: int, mode: str, pairs: bool = False) -> str:
+    text = nvrtc.compile_cuda(straight(loads, pairs), "sm_70", OPTIONS)
     return generate(ptx.parse(text).kernels["kernel"], {}, mode, 16).text
 
 
@@ -34,6 +36,13 @@ def test_a_piece_of_code_has_few_gathers_however_long_it_is(mode: str) -> None:
     assert many <= 2
     sizes = [len(llvm_text(loads, mode).splitlines()) for loads in (200, 400, 800)]
     assert sizes[2] - sizes[1] <= 2.1 * (sizes[1] - sizes[0]), "text grows with the number of loads"
+
+
+def test_a_load_of_two_doubles_is_two_gathers() -> None:
+    few, many = (
+        llvm_text(loads, "run", pairs=True).count("call <16 x double> @llvm.masked.gather") for loads in (32, 33)
+    )
+    assert (few, many) == (MOST_GATHERS, 0)
 
 
 PROGRAM = """
