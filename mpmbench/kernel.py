@@ -17,7 +17,8 @@ from mpmbench.errors import InputError
 
 RAW_KERNELS = Path(__file__).parent / "raw_kernels"
 
-# One list for every device. CuPy always flushes denormals, so all kernels do; no fast-math, fma contraction as is.
+# One list for every device. CuPy always flushes denormals, so all kernels do. Fast math and contraction are NVRTC's
+# defaults here: a source that wants them otherwise has options of its own.
 COMPILE_OPTIONS: tuple[str, ...] = ("-std=c++17", "-ftz=true", "-lineinfo", "-default-device")
 
 _INCLUDE = re.compile(r'^\s*#\s*include\s+"([^"]+)"')
@@ -29,28 +30,38 @@ class KernelSource:
     """One self-contained CUDA C++ text.
 
     name: stem of the file.  text: what the compiler is given.  constants: the generated ``#define`` block as pairs.
-    sha256: hex digest of the text; records carry it.
+    sha256: hex digest of the text, and of the options if there are any; records carry it.
+    options: of NVRTC, beside those that all kernels have.
     """
 
     name: str
     text: str = field(repr=False)
     constants: tuple[tuple[str, str], ...]
     sha256: str
+    options: tuple[str, ...] = ()
+
+    @property
+    def all_options(self) -> tuple[str, ...]:
+        """What NVRTC is told, the architecture aside."""
+        return (*COMPILE_OPTIONS, *self.options)
 
 
 def compile_options(arch: str) -> tuple[str, ...]:
-    """All NVRTC options for a target such as ``sm_52``."""
+    """NVRTC's options for a target such as ``sm_52``, of a source that has none of its own."""
     return (f"--gpu-architecture={arch.replace('sm_', 'compute_')}", *COMPILE_OPTIONS)
 
 
 def load_source(
-    stem_or_path: str | Path, constants: Mapping[str, object], include_dirs: Sequence[Path] = ()
+    stem_or_path: str | Path,
+    constants: Mapping[str, object],
+    include_dirs: Sequence[Path] = (),
+    options: tuple[str, ...] = (),
 ) -> KernelSource:
     """Read a kernel and inline its headers.
 
     stem_or_path: ``"p2g_block_sync"`` for a shipped kernel, or the path of any ``.cu`` file.
     constants: macro name -> value (bool becomes 0 or 1). include_dirs are searched after the including file's own
-    folder and before the shipped headers. Raises InputError where a file is missing.
+    folder and before the shipped headers. options: of NVRTC, for this source. Raises InputError for a missing file.
     """
     path = Path(stem_or_path)
     if path.suffix != ".cu":
@@ -59,7 +70,9 @@ def load_source(
     lines = [f"#define {name} {value}" for name, value in defines]
     _inline(path, (*include_dirs, RAW_KERNELS), lines, seen=set(), asked_by=None)
     text = "\n".join(lines) + "\n"
-    return KernelSource(path.stem, text, defines, hashlib.sha256(text.encode()).hexdigest())
+    # Without options a hash is that of the text alone: results of before there were any keep theirs.
+    digest = hashlib.sha256("\0".join((text, *options)).encode()).hexdigest()
+    return KernelSource(path.stem, text, defines, digest, options)
 
 
 def parameter_names(text: str, entry: str) -> tuple[str, ...]:

@@ -20,11 +20,13 @@ class Launcher:
     device: Device
     kernels: dict[Any, CompiledKernel]
 
-    def compile(self, path: Path, entry: str, constants: Mapping[str, object]) -> CompiledKernel:
-        """The kernel ``entry`` of a source under these constants, compiled once."""
-        key = (path, tuple(constants.items()))
+    def compile(
+        self, path: Path, entry: str, constants: Mapping[str, object], options: tuple[str, ...] = ()
+    ) -> CompiledKernel:
+        """The kernel ``entry`` of a source under these constants and options of NVRTC, compiled once."""
+        key = (path, tuple(constants.items()), options)
         if key not in self.kernels:
-            self.kernels[key] = self.device.compile(load_source(path, constants), entry)
+            self.kernels[key] = self.device.compile(load_source(path, constants, options=options), entry)
         return self.kernels[key]
 
     def launch(self, kernel: CompiledKernel, count: int, threads: int, *args: Any) -> tuple[Launch, ...]:

@@ -14,7 +14,7 @@ from mpmbench.errors import InputError, MpmbenchError
 from mpmbench.grid import Grid, Triple
 from mpmbench.launcher import INT32_LIMIT, THREADS, Launcher
 from mpmbench.primitives.scan_lookback import state_length
-from mpmbench.variants import ATTRIBUTES, AXES, RESULTS, Variant
+from mpmbench.variants import ATTRIBUTES, AXES, COMPILER_OPTIONS, RESULTS, Variant
 
 BufferTable = dict[str, tuple[tuple[int, ...], np.dtype]]
 
@@ -47,6 +47,11 @@ def kernel_constants(axes: Mapping[str, Any]) -> dict[str, object]:
         "BLOCK_Z": z,
         "BATCH": axes.get("batching", 1),
     }
+
+
+def kernel_options(axes: Mapping[str, Any]) -> tuple[str, ...]:
+    """NVRTC's options for a strategy's own kernel; none for the default axes."""
+    return tuple(option for (axis, value), option in COMPILER_OPTIONS.items() if axes.get(axis) == value)
 
 
 # For kernels that do not depend on a constant: one text, and so one compilation, for all its values.
@@ -194,8 +199,8 @@ class Workspace(Launcher):
 
     @property
     def kernel(self) -> CompiledKernel:
-        """The strategy's own kernel, compiled for all its axes."""
-        return self.compile(self.variant.kernel_path, self.variant.kernel, self.constants)
+        """The strategy's own kernel, compiled for all its axes; only it takes their options of the compiler."""
+        return self.compile(self.variant.kernel_path, self.variant.kernel, self.constants, kernel_options(self.axes))
 
     def helper(self, stem: str, uses: tuple[str, ...] = (), **constants: object) -> CompiledKernel:
         """A shipped preprocessing kernel. ``uses``: the constants it depends on; the others stay neutral."""

@@ -1,4 +1,5 @@
-"""A small, seeded covering array: rows in which every pair of possible values of two factors meets at least once."""
+"""Which combinations of axes tests take: a small, seeded covering array, in which every pair of possible values of two
+factors meets at least once, or every combination that has a text of its own."""
 
 from __future__ import annotations
 
@@ -6,6 +7,8 @@ import itertools
 import random
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
+
+from mpmbench.variants import COMPILER_OPTIONS, Variant, why_impossible
 
 Row = dict[str, Any]
 
@@ -51,3 +54,12 @@ def covering_rows(
                 todo.pop(covered, None)
         todo.pop(pair, None)  # where no row could be completed the pair cannot exist
     return rows
+
+
+def texts_of(variant: Variant) -> list[Row]:
+    """Every possible combination of a strategy's axes under the compiler's usual options: those would make four times
+    as many and change no text. In covering arrays each of them meets every other value."""
+    told = {axis for axis, _ in COMPILER_OPTIONS}
+    values = [values[:1] if axis in told else values for axis, values in variant.axes.items()]
+    rows = [dict(zip(variant.axes, row, strict=True)) for row in itertools.product(*values)]
+    return [axes for axes in rows if why_impossible(variant, axes) is None]

@@ -6,7 +6,7 @@ import itertools
 import os
 import random
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pairwise import covering_rows
+from pairwise import covering_rows, texts_of
 
 from mpmbench import primitives
 from mpmbench.dataset import Dataset
@@ -29,7 +29,7 @@ from mpmbench.reference import Nodes
 from mpmbench.simt import cache as disk_cache
 from mpmbench.simt.nvrtc import compile_cuda
 from mpmbench.variants import AXES, SHARED_LIMIT, Variant, discover, resolve_axes, why_impossible
-from mpmbench.workspace import kernel_constants
+from mpmbench.workspace import kernel_constants, kernel_options
 
 MAIN_ARCHS = ("sm_52", "sm_90")  # the GPU of the thesis and a current one: every axis
 ARCHS = ("sm_52", "sm_70", "sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")  # default axes
@@ -182,18 +182,57 @@ def test_shared_memory_is_what_the_variant_says(name: str) -> None:
         compiled(own_kernel(variant, chosen[refused[0]]), "sm_52")
 
 
+def test_only_the_strategys_own_kernel_takes_the_compilers_options() -> None:
+    for variant in VARIANTS.values():
+        plain = kernels_of(variant, resolve_axes(variant, {}))
+        assert not any(source.options for source, _ in plain.values())
+        told = kernels_of(variant, resolve_axes(variant, {"math": "fast", "contraction": "none"}))
+        assert {entry: source.options for source, entry in told.values() if source.options} == {
+            variant.kernel: ("--use_fast_math", "--fmad=false")
+        }
+        assert len(told.keys() - plain.keys()) == 1, "the hash of one kernel changes"
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_what_the_compilers_options_change(name: str) -> None:
+    """Without contraction no fused multiply-add is left, of fast math or not. Fast math finds nothing to do in the
+    shipped kernels: no division of floats, no root, no function, and denormals are flushed anyway."""
+    variant = VARIANTS[name]
+    ptx = {}
+    for math, contraction in itertools.product(variant.axes["math"], variant.axes["contraction"]):
+        axes = {"math": math, "contraction": contraction, "payload": "apic", "writing": "literal"}
+        source, _ = own_kernel(variant, resolve_axes(variant, axes))
+        ptx[math, contraction] = compile_cuda(source.text, "sm_52", source.all_options, f"{source.name}.cu")
+    assert "fma.rn.ftz.f32" in ptx["ieee", "fma"]
+    assert not any(line.lstrip().startswith("fma") for line in ptx["ieee", "none"].splitlines())
+    assert ptx["fast", "fma"] == ptx["ieee", "fma"]
+    assert ptx["fast", "none"] == ptx["ieee", "none"]
+
+
+def test_facts_are_those_of_a_sources_own_options() -> None:
+    """Two instructions for a product and a sum, and a division of several instructions in place of a call."""
+    text = 'extern "C" __global__ void some(float* a) { a[0] = a[1] * a[2] + a[3] / a[4]; }'
+    sizes = [
+        source_infos(KernelSource("some", text, (), "", options), "sm_90")["some"].sass_instructions or 0
+        for options in ((), ("--fmad=false",), ("--use_fast_math",), ("--use_fast_math", "--fmad=false"))
+    ]
+    assert sizes[0] < sizes[1]
+    assert sizes[2] < sizes[0]
+    assert sizes[2] < sizes[3] < sizes[1]
+
+
 def own_kernel(variant: Variant, axes: dict[str, Any]) -> Kernel:
-    return load_source(variant.kernel_path, kernel_constants(axes)), variant.kernel
+    return load_source(variant.kernel_path, kernel_constants(axes), options=kernel_options(axes)), variant.kernel
 
 
 @pytest.mark.slow
 def test_full_product(tmp_path_factory) -> None:
-    """Every combination of every axis for the main architectures, in a seeded random order. It takes hours: what has
-    compiled is noted in the cache folder, and a run that was stopped goes on where it was."""
+    """Every combination of the axes that change texts, for the main architectures, in a seeded random order. It takes
+    hours: what has compiled is noted in the cache folder, and a run that was stopped goes on where it was."""
     journal = disk_cache.cache_folder() / "compiled-product.txt"
     journal.parent.mkdir(parents=True, exist_ok=True)
     done = set(journal.read_text().split()) if journal.exists() else set()
-    everything = [(variant, axes) for variant in VARIANTS.values() for axes in product(variant)]
+    everything = [(variant, axes) for variant in VARIANTS.values() for axes in texts_of(variant)]
     random.Random(1).shuffle(everything)
     with pytest.MonkeyPatch.context() as patch, journal.open("a") as notes:
         patch.setattr(disk_cache, "store", lambda *_: None)  # 100,000 texts would fill the disk
@@ -204,13 +243,6 @@ def test_full_product(tmp_path_factory) -> None:
                 done.add(key.split()[0])
                 notes.write(key.split()[0] + "\n")
             notes.flush()
-
-
-def product(variant: Variant) -> Iterator[dict[str, Any]]:
-    for values in itertools.product(*variant.axes.values()):
-        axes = dict(zip(variant.axes, values, strict=True))
-        if why_impossible(variant, axes) is None:
-            yield axes
 
 
 # ptxas itself

@@ -8,6 +8,7 @@ import hashlib
 import inspect
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cupy
@@ -123,12 +124,16 @@ def test_options_are_those_of_the_simulated_device_once_cupy_has_added_its_own()
     assert "--device-as-default-execution-space" in text
 
 
-def test_both_devices_get_the_same_ptx() -> None:
+@pytest.mark.parametrize("options", [(), ("--use_fast_math",), ("--fmad=false",), ("--use_fast_math", "--fmad=false")])
+def test_both_devices_get_the_same_ptx(gpu: FakeGpu, options: tuple[str, ...]) -> None:
     """CuPy's way to PTX and ours agree to the last character of code."""
-    program = cupy.cuda.compiler._NVRTCProgram(AXPY, "fake.cu", method="ptx")
-    ours, _ = program.compile(compile_options("sm_52"))
+    text = AXPY.replace("grid.scale *", "grid.scale / (1 + x[i]) *")  # something that fast math changes
+    program = cupy.cuda.compiler._NVRTCProgram(text, "fake.cu", method="ptx")
+    ours, _ = program.compile((*compile_options(f"sm_{gpu.capability}"), *options))
     ours = ours.decode() if isinstance(ours, bytes) else ours
-    assert compile_as_cupy_does(AXPY, cupy_options(COMPILE_OPTIONS), "52") == ours
+    kernel = CudaDevice("cuda").compile(replace(source(text), options=options), "axpy")
+    assert kernel.handle.ptx == ours
+    assert compile_as_cupy_does(text, cupy_options((*COMPILE_OPTIONS, *options)), gpu.capability) == ours
 
 
 def test_property_names_exist_in_cupy() -> None:

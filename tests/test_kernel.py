@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 import pytest
 
 from mpmbench.errors import InputError
-from mpmbench.kernel import compile_options, load_source
+from mpmbench.kernel import COMPILE_OPTIONS, compile_options, load_source
 from mpmbench.simt.nvrtc import compile_cuda
 from mpmbench.workspace import NEUTRAL
 
@@ -44,6 +45,15 @@ def test_hash_covers_constants_and_headers_but_not_the_place(folder: Path, tmp_p
     assert load_source(elsewhere / "a.cu", {"N": 3}).sha256 == first
     (folder / "c.cuh").write_text("CHANGED\n")
     assert load_source(folder / "a.cu", {"N": 3}).sha256 != first
+
+
+def test_hash_covers_options_and_is_that_of_the_text_without_any(folder: Path) -> None:
+    plain = load_source(folder / "a.cu", {"N": 3})
+    assert plain.sha256 == hashlib.sha256(plain.text.encode()).hexdigest()
+    sources = [plain, *(load_source(folder / "a.cu", {"N": 3}, options=o) for o in (("-x",), ("-y",), ("-x", "-y")))]
+    assert len({source.sha256 for source in sources}) == 4
+    assert {source.text for source in sources} == {plain.text}
+    assert sources[3].all_options == (*COMPILE_OPTIONS, "-x", "-y")
 
 
 def test_a_users_kernel_finds_its_own_and_the_shipped_headers(tmp_path: Path) -> None:

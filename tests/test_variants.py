@@ -15,8 +15,9 @@ from transfers import crowded, filled, make_plan, transfer
 
 from mpmbench import device as devices
 from mpmbench.awkward import awkward_datasets
+from mpmbench.device import Launch
 from mpmbench.errors import InputError
-from mpmbench.kernel import RAW_KERNELS, load_source
+from mpmbench.kernel import RAW_KERNELS, KernelSource, load_source
 from mpmbench.plan import build_plan, floor_bytes, predict_bytes, touched_nodes
 from mpmbench.variants import AXES, discover, get, resolve_axes, why_impossible
 from mpmbench.workspace import buffer_table, kernel_constants
@@ -282,6 +283,33 @@ def test_shared_memory_is_what_the_limit_assumes(monkeypatch, name: str, axes: d
     assert f"needs {declared} bytes" in why_impossible(variant, resolved)
     monkeypatch.setattr(variants, "SHARED_LIMIT", declared)
     assert why_impossible(variant, resolved) is None
+
+
+def test_without_contraction_results_are_right_and_rounded_otherwise(counting) -> None:
+    dataset, mass, count = crowded(), {}, {}
+    for contraction in AXES["contraction"]:
+        plan = make_plan(get("p2g_block_sync"), dataset, counting, contraction=contraction, **QUICK)
+        plan.run_once(counting)
+        mass[contraction] = plan.outputs().mass
+        count[contraction] = tally(counting, "p2g_block_sync", dataset, contraction=contraction, **QUICK).lane_inst
+    assert count["none"] > count["fma"], "a product and a sum are two instructions"
+    assert (mass["none"] != mass["fma"]).any()
+
+
+def test_fast_math_of_a_kernel_that_divides(device) -> None:
+    """Division, root and functions become approximate ones, which agree to a few units of the last place."""
+    text = """extern "C" __global__ void divides(const float* x, float* y) {
+        const int i = threadIdx.x;
+        y[i] = x[i] / (x[i] + 2) + sqrtf(x[i]) * expf(x[i]) - rsqrtf(x[i]); }"""
+    source = KernelSource("divides", text, (), "fast", ("--use_fast_math",))
+    ptx = device.ptx(source)
+    assert {"div.approx", "sqrt.approx", "ex2.approx", "rsqrt.approx"} <= set(re.findall(r"[a-z0-9]+\.approx", ptx))
+    x = np.linspace(0.1, 3, 64, dtype=np.float32)
+    y = device.empty(64, np.float32)
+    device.launch(Launch("divides", device.compile(source, "divides"), (1, 1, 1), (64, 1, 1), (device.upload(x), y)))
+    exact = x.astype(float)
+    want = exact / (exact + 2) + np.sqrt(exact) * np.exp(exact) - 1 / np.sqrt(exact)
+    np.testing.assert_allclose(device.download(y), want, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", NAMES)

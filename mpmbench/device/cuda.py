@@ -172,7 +172,7 @@ class CudaDevice:
         compile_error = self._cupy.cuda.compiler.CompileException
         try:
             with self._errors(f"cannot compile and load kernel {entry} of {source.name}"), self._current():
-                module = self._cupy.RawModule(code=source.text, options=cupy_options(COMPILE_OPTIONS))
+                module = self._cupy.RawModule(code=source.text, options=cupy_options(source.all_options))
                 kernel = module.get_function(entry)  # compiles and loads: none of it may land in the first sample
         except compile_error as error:
             raise InputError(f"{source.name} does not compile for {self.arch}: {_first_error(str(error))}") from error

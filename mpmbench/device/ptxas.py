@@ -17,7 +17,7 @@ from pathlib import Path
 
 from mpmbench.device import KernelInfo, cubin
 from mpmbench.errors import InputError
-from mpmbench.kernel import COMPILE_OPTIONS, KernelSource
+from mpmbench.kernel import KernelSource
 from mpmbench.simt import cache
 from mpmbench.simt.counters import SourceLine
 from mpmbench.simt.nvrtc import compile_cuda
@@ -68,7 +68,7 @@ def kernel_infos(ptx: str, arch: str) -> dict[str, KernelInfo]:
 
 def source_infos(source: KernelSource, arch: str) -> dict[str, KernelInfo]:
     """The same for a kernel source: NVRTC to PTX, then ``ptxas``."""
-    return kernel_infos(compile_cuda(source.text, arch, COMPILE_OPTIONS, f"{source.name}.cu"), arch)
+    return kernel_infos(compile_cuda(source.text, arch, source.all_options, f"{source.name}.cu"), arch)
 
 
 def sass_lines(ptx: str, arch: str, entry: str) -> dict[SourceLine, int]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from mpmbench.device import CompiledKernel, KernelInfo, Launch, LaunchProfile, LaunchReport
 from mpmbench.errors import InputError
-from mpmbench.kernel import COMPILE_OPTIONS, KernelSource, parameter_names
+from mpmbench.kernel import KernelSource, parameter_names
 from mpmbench.simt.machine import Machine
 from mpmbench.simt.nvrtc import compile_cuda, supported_archs
 
@@ -72,7 +72,7 @@ class SimulatedDevice:
 
     def ptx(self, source: KernelSource) -> str:
         """The PTX of a source for this device's architecture."""
-        return compile_cuda(source.text, self.arch, COMPILE_OPTIONS, name=f"{source.name}.cu")
+        return compile_cuda(source.text, self.arch, source.all_options, name=f"{source.name}.cu")
 
     def compile(self, source: KernelSource, entry: str) -> CompiledKernel:
         if source.sha256 not in self._modules:

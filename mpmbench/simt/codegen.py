@@ -301,6 +301,7 @@ class SegmentBody:
         self.counts, self.checks = generator.counts, generator.mode == "debug"
         self.observes = self.counts or self.checks
         instructions = generator.kernel.instructions[segment.start : segment.stop]
+        self.loads_by_lane = sum(map(codegen_memory.gathers_of, instructions)) > codegen_memory.MOST_GATHERS
         self.forms = generator.forms.of_block(instructions, segment.start)
         self.values: dict[Reg, str] = {}
         self.written: set[Reg] = set()

@@ -30,6 +30,7 @@ _HINTS = re.compile(
 _SPACES = frozenset({"global", "shared", "local", "const", "param"})
 
 
+MOST_GATHERS = 64  # of a segment; with more, each lane loads for itself
 _SHARED_QUADS = 4  # runs that must share a quad before it is worth staging it apart
 
 
@@ -64,6 +65,14 @@ def access_of(item: Instruction) -> Access:
         elif not _HINTS.match(flag):
             raise Refused
     return Access(space, operation, kind, count, _order(flags))
+
+
+def gathers_of(item: Instruction) -> int:
+    """How many gathers a load becomes where its segment has few of them."""
+    if item.root != "ld" or "param" in item.modifiers or item.modifiers[-1] not in ELEMENT:
+        return 0
+    count = 4 if "v4" in item.modifiers else 2 if "v2" in item.modifiers else 1
+    return {4: 1, 8: 1, 16: 2 if count == 2 else 0}.get(count * ELEMENT_BYTES[ELEMENT[item.modifiers[-1]]], 0)
 
 
 def _order(flags: Sequence[str]) -> str:
@@ -256,11 +265,17 @@ def _load(ctx: SegmentBody, index: int, item: Instruction, access: Access, addre
         whole = _load_small(ctx, index, access, address, f"i{8 * access.width}")
         values = _split(ctx, whole, 8 * access.width, access.count, element)
     elif access.width in (4, 8):
-        whole = _gather(ctx, _place(ctx, access.space, address), f"i{8 * access.width}", access.width)
+        if ctx.loads_by_lane:
+            whole = _load_lane_by_lane(ctx, index, access, address, f"i{8 * access.width}")
+        else:
+            whole = _gather(ctx, _place(ctx, access.space, address), f"i{8 * access.width}", access.width)
         values = _split(ctx, whole, 8 * access.width, access.count, element)
     elif access.count == 2 and access.width == 16:
-        place = _place(ctx, access.space, address)
-        values = [_gather(ctx, place, element, 8, 8 * part) for part in range(2)]
+        if ctx.loads_by_lane:
+            values = [_load_lane_by_lane(ctx, index, access, address, element, 8 * part) for part in range(2)]
+        else:
+            place = _place(ctx, access.space, address)
+            values = [_gather(ctx, place, element, 8, 8 * part) for part in range(2)]
     else:
         raise Refused
     for position, value in enumerate(values):
@@ -291,6 +306,25 @@ def _gather(ctx: SegmentBody, place: Place, element: str, align: int, extra: int
         f"call {vector} @llvm.masked.gather.{suffix}({w.vector('ptr')} align {align} {pointers}, {masks} {mask}, "
         f"{vector} zeroinitializer)"
     )
+
+
+def _load_lane_by_lane(
+    ctx: SegmentBody, index: int, access: Access, address: Address, element: str, extra: int = 0
+) -> str:
+    """What a gather gives the active lanes, in straight code; lanes that are not active read from the sink.
+
+    For a processor without fast gathers LLVM turns each into a branch per lane, with the whole vector in a phi after
+    every one. Joining their registers takes a time that grows with the square of the number of gathers, or faster.
+    """
+    w = ctx.w
+    buffer, displacement, base, _, _ = _address_buffer(ctx, index, access.space, address)
+    chunk, vector = ctx.chunk_of(buffer), w.vector(element)
+    value = "poison"
+    for lane in range(w.lanes):
+        pointer = _lane_address(ctx, chunk, lane, base, displacement + extra)
+        one = w.load(element, pointer, ELEMENT_BYTES[element])
+        value = w.value(f"insertelement {vector} {value}, {element} {one}, i32 {lane}")
+    return value
 
 
 def _split(ctx: SegmentBody, whole: str, bits: int, count: int, element: str) -> list[str]:

@@ -41,6 +41,8 @@ AXES: dict[str, tuple[Any, ...]] = {
     "block_shape": ((8, 4, 4), (4, 4, 4), (8, 8, 4), (4, 4, 2), (3, 5, 2)),
     "batching": (1, 2, 4, 8),
     "blocks": ("active", "all"),
+    "math": ("ieee", "fast"),
+    "contraction": ("fma", "none"),
 }
 
 # The axes of every kernel that gives each particle a thread, in any order; the first value is the default.
@@ -48,10 +50,18 @@ GLOBAL_AXES: dict[str, tuple[Any, ...]] = {
     name: AXES[name]
     for name in (
         "dtype", "spline", "payload", "layout", "weights", "writing", "particle_order", "cell_index", "block_shape",
+        "math", "contraction",
     )
 }  # fmt: skip
 # The axes of kernels that give each block a thread block: particles must be sorted.
 BLOCK_AXES: dict[str, tuple[Any, ...]] = {**AXES, "particle_order": ("deep", "index")}
+
+# Values that are options of NVRTC, not constants of a kernel's text. The compiler takes the later of two that disagree,
+# so that a kernel of fast math has no contraction where that is asked for.
+COMPILER_OPTIONS: dict[tuple[str, Any], str] = {
+    ("math", "fast"): "--use_fast_math",
+    ("contraction", "none"): "--fmad=false",
+}
 
 PREPROCESSING = ("bins", "block_maximum", "halo_maximum")
 ATTRIBUTES = {"pic": 2, "apic": 5}  # four-component attributes per particle
