@@ -14,7 +14,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from mpmbench.dataset import Dataset, load_dataset
-from mpmbench.errors import InputError, MpmbenchError, WrongResultError
+from mpmbench.errors import InputError, MpmbenchError
 from mpmbench.grid import Grid
 
 if TYPE_CHECKING:
@@ -27,7 +27,6 @@ __all__ = [
     "Grid",
     "InputError",
     "MpmbenchError",
-    "WrongResultError",
     "g2p",
     "list_datasets",
     "list_devices",

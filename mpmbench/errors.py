@@ -14,9 +14,3 @@ class InputError(MpmbenchError):
     shape or dtype, no GPU, no compiler, full disk. Exit code 2."""
 
     exit_code = 2
-
-
-class WrongResultError(MpmbenchError):
-    """A kernel's result misses its reference, or the engine has findings. Exit code 4."""
-
-    exit_code = 4
