@@ -9,7 +9,7 @@ BIN    := $(VENV)/bin
 
 help:
 	@echo "make demo      run every strategy on three datasets, leave reports/demo/report.html"
-	@echo "make test      install and run the tests, the linter and the type checker (about 10 minutes)"
+	@echo "make test      install and run the tests, the linter and the type checker (some 12 minutes the first time)"
 	@echo "make test-all  the full product of axes on top; resumable"
 	@echo "make bench     engine against native CPU code, NVIDIA Warp and Taichi (CPU wall clock)"
 
