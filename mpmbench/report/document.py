@@ -146,7 +146,7 @@ def build(records: Sequence[Record], extent: Extent = EXTENTS[0]) -> Document:
         _group_section(g, extent, charted=i < extent.charts, name_device=several_devices)
         for i, g in enumerate(groups[: extent.groups])
     ]
-    if found_patterns := banks.patterns(transfers):
+    if found_patterns := banks.patterns([r for r in transfers if r.device != "cpu"]):
         pictures = tuple(map(banks.picture, found_patterns[:4])) if extent.charts else ()
         title = "Shared-memory banks of the block kernels"
         sections.append(Section(title, (banks.table(found_patterns),), pictures, intro=banks.EXPLANATION))
