@@ -176,8 +176,8 @@ def _run_batch(
     clock = clock_of(device, timing.cache)
     question = f"{cases[0].title.partition(' on ')[2]}: {len(contenders)} in rounds"
 
-    def told(rounds: int, state: str) -> None:
-        tick(f"{question}, round {rounds}{f', {state}' if state else ''}")
+    def told(rounds: int) -> None:
+        tick(f"{question}, round {rounds}")
 
     contest = run_rounds([c.arm(device) for c in contenders], clock, timing.rules, seed, told)
     name = uuid4().hex[:12]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -112,16 +111,12 @@ COLD_START = Rules(warmup_seconds=0, warmup_limit=0, min_rounds=3, max_rounds=3,
 def test_every_pass_holds_every_arm_and_the_baseline_again() -> None:
     clock = Tape()
     run_rounds(arms("a", "b", "c"), clock, COLD_START, seed=5)
-    passes = list(itertools.batched(clock.names[3:], 4)) if hasattr(itertools, "batched") else _fours(clock.names[3:])
+    passes = [tuple(clock.names[i : i + 4]) for i in range(3, len(clock.names), 4)]
     assert clock.names[:3] == ["a", "b", "c"], "one warm-up run of each"
     assert len(passes) == 12
     assert all(sorted(one) == ["a", "a again", "b", "c"] for one in passes)
     assert all(passes[i] == passes[i + 1][::-1] for i in range(0, 12, 2)), "each order is followed by its reverse"
     assert len(set(passes)) > 4, "the order is random"
-
-
-def _fours(names: list[str]) -> list[tuple[str, ...]]:
-    return [tuple(names[i : i + 4]) for i in range(0, len(names), 4)]
 
 
 def test_the_seed_decides_the_order() -> None:

@@ -133,17 +133,17 @@ def run_rounds(
     clock: Clock,
     rules: Rules | None = None,
     seed: int = 0,
-    tick: Callable[[int, str], None] | None = None,
+    tick: Callable[[int], None] | None = None,
 ) -> Contest:
     """Time the arms against each other; the first is the baseline.
 
-    tick: told after each round how many there have been and what is still open.
+    tick: told after each round how many there have been.
     """
     if not arms:
         raise InputError("nothing to time")
     if len({arm.name for arm in arms}) < len(arms):
         raise InputError("two arms have one name")
-    return _Rounds(arms, clock, rules or Rules(), seed, tick or (lambda rounds, state: None)).run()
+    return _Rounds(arms, clock, rules or Rules(), seed, tick or (lambda rounds: None)).run()
 
 
 def looks(rules: Rules) -> list[int]:
@@ -162,9 +162,7 @@ def confidence_at(look: int, confidence: float) -> float:
 class _Rounds:
     """One contest under way."""
 
-    def __init__(
-        self, arms: Sequence[Arm], clock: Clock, rules: Rules, seed: int, tick: Callable[[int, str], None]
-    ) -> None:
+    def __init__(self, arms: Sequence[Arm], clock: Clock, rules: Rules, seed: int, tick: Callable[[int], None]) -> None:
         self.clock, self.rules, self.seed, self.tick = clock, rules, seed, tick
         self.baseline = arms[0]
         # The copy of the baseline runs the same code on the same buffers; only its name differs.
@@ -197,7 +195,7 @@ class _Rounds:
                 look += 1
                 if stopped_by := self._stop_reason(standing, last):
                     return self._contest(standing, rounds, warmups, stopped_by)
-            self.tick(rounds, "")
+            self.tick(rounds)
 
     def _warm_up(self, arm: Arm) -> int:
         """Run an arm until the processor has its working clock; returns how often."""
