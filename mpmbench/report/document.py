@@ -25,7 +25,7 @@ from mpmbench.report import (
 )
 from mpmbench.report import table as tables
 from mpmbench.report.chart_data import Chart
-from mpmbench.report.doubts import doubts, throttled, throttled_action
+from mpmbench.report.doubts import NAMED, doubts, throttled, throttled_action
 from mpmbench.report.modelled import GpuGroup
 from mpmbench.report.plots import MOST_BARS, Bars, Line, Lines, first_of, thin
 from mpmbench.report.profile import Card
@@ -33,7 +33,6 @@ from mpmbench.report.table import Group, Kind, Table
 from mpmbench.report.text import number
 
 MOST_VALUES = 12  # of one fact about the environment
-NAMED = 5  # runs (or sentences) of one sort that are spelt out; the tables hold all
 
 KINDS = {
     Kind.CHECKED: "compared with the float64 reference, or one run with another of the same",

@@ -24,7 +24,7 @@ NOISY = 0.10  # interquartile range over median
 TOO_NOISY = 0.25
 OFTEN = 0.05  # share of rounds
 CACHE_BOUND = 5  # below so many times the cache, cold and hot caches have been seen to rank differently
-NAMED = 5
+NAMED = 5  # runs (or sentences) of one sort that are spelt out; the tables hold all
 
 # Options of a run that say where its results go: a second run must not write over them.
 _TARGETS = ("--json", "--html", "--md", "--csv", "--nvbench")
