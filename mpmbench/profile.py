@@ -27,7 +27,7 @@ from mpmbench.simt.machine import MemoryTally
 _SHARE_OF: Mapping[str, Callable[[Tally, MemoryTally], int]] = {
     "issue": lambda tally, memory: tally.warp_inst,
     "latency": lambda tally, memory: tally.warp_inst,
-    "shared": lambda tally, memory: tally.shm_wavefronts + CAS_PASSES * tally.satom_iter,
+    "shared": lambda tally, memory: tally.shm_wavefronts + CAS_PASSES * tally.satom_wavefronts,
     "l1": lambda tally, memory: memory.l1_request_bytes,
     "l2": lambda tally, memory: memory.l2_sectors,
     "dram": lambda tally, memory: memory.dram_sectors,

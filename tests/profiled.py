@@ -106,6 +106,7 @@ def record(variant: str = "p2g_global_atomic", profiles: tuple[Profile, ...] = (
         tally.sld_req, tally.sst_req, tally.shm_wavefronts = 2_000_000, 2_000_000, 7_000_000
     if variant == "p2g_block_atomic":
         tally.satom_req, tally.satom_lane, tally.satom_iter = 4_000_000, 120_000_000, 13_000_000
+        tally.satom_wavefronts = 13_000_000
     steps = {"grid_clear": StepCost(Counters(Tally(warp_inst=100, gst_sectors=1000)))}
     if axes["particle_order"] != "given":
         steps["bin"] = StepCost(Counters(Tally(warp_inst=200_000, gld_sectors=400_000)))

@@ -49,8 +49,9 @@ def test_units_share_the_issue_slots_and_a_slow_one_can_bind():
 
 def test_rounds_of_a_float_atomic_in_shared_memory_are_instructions_and_wavefronts():
     opcodes = {("atom.shared.add.f32", None): 100}
-    few, many = (terms(launch(opcodes=opcodes, tally=Tally(satom_req=100, satom_iter=rounds))) for rounds in (100, 300))
-    assert many["shared"] - few["shared"] == pytest.approx(3 * 200 / 10 / 1e9)
+    tallies = (Tally(satom_req=100, satom_iter=rounds, satom_wavefronts=4 * rounds) for rounds in (100, 300))
+    few, many = (terms(launch(opcodes=opcodes, tally=tally)) for tally in tallies)
+    assert many["shared"] - few["shared"] == pytest.approx(3 * 4 * 200 / 10 / 1e9)
     # Five instructions a round, two per cycle.
     assert many["issue"] - few["issue"] == pytest.approx(200 * 5 / 2 / 10 / 1e9)
     whole = {("atom.shared.add.u32", None): 100}

@@ -4,7 +4,7 @@ The template is Zhang and Owens (HPCA 2011), throughput of the busiest unit, wit
 latency bound after Volkov (2016). With counts per launch, N SMs that have work, and f the SM clock:
 
     issue        machine instructions / (4 eta) or, if that is more, those of one class / its rate; / (N f)
-    shared       (wavefronts + 3 rounds of float atomics + global requests) / (N f)
+    shared       (wavefronts + 3 x those of shared atomics + global requests) / (N f)
     l1           bytes that loads ask for / bytes per cycle / (N f)
     l2           32 B x sectors / L2 bandwidth
     dram         32 B x sectors read and written / achieved DRAM bandwidth
@@ -125,7 +125,7 @@ def terms_of(gpu: Gpu, launch: LaunchProfile, rates: Rates) -> dict[str, float]:
     requests = tally.gld_req + tally.gst_req + tally.gatom_req
     return {
         "issue": issue_cycles(gpu, launch) / sm_cycles,
-        "shared": (tally.shm_wavefronts + CAS_PASSES * tally.satom_iter + requests) / sm_cycles,
+        "shared": (tally.shm_wavefronts + CAS_PASSES * tally.satom_wavefronts + requests) / sm_cycles,
         "l1": memory.l1_request_bytes / gpu["l1_bytes_per_clk"] / sm_cycles,
         "l2": SECTOR_BYTES * memory.l2_sectors / gpu["l2_bandwidth"],
         "dram": SECTOR_BYTES * memory.dram_sectors / rates.dram_bandwidth,

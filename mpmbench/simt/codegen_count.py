@@ -24,7 +24,8 @@ PARTS = ("global", "shared", "local")
 SUPPORT_FUNCTIONS = (
     "count_global",
     "count_atomics",
-    "count_shared_atomics",
+    "count_shared_atomics_4",
+    "count_shared_atomics_8",
     "count_shared_4",
     "count_shared_8",
     "count_shared_16",
@@ -76,7 +77,8 @@ def count_sites(g: _Generator, sites: Sequence[Site], first: int, buffer: str, d
     """One request of each of ``sites``, which access consecutive words; first: number of the first of them.
 
     buffer: addresses of the 32 lanes; in shared memory they may count from its start, which is aligned.
-    -> what one site's request takes of shared memory, as an i64: wavefronts, or rounds of an atomic.
+    -> what one site's request takes of shared memory, as an i64: wavefronts; of an atomic its rounds, and from bit 32
+    on their wavefronts.
     """
     w, site = g.w, sites[0]
     counters = w.at(_counters(g), 8 * (SEGMENT_WORDS * len(g.segments) + SITE_WORDS * first))
@@ -93,7 +95,7 @@ def _count_part(
     if space == "local":
         function = "count_local"
     elif space == "shared":
-        function = "count_shared_atomics" if site.kind == "atomic" else f"count_shared_{_group(site.width)}"
+        function = f"count_shared_{'atomics_' if site.kind == 'atomic' else ''}{_group(site.width)}"
     else:
         function = "count_atomics" if site.kind == "atomic" else "count_global"
     part = w.at(counters, 8 * PART_WORDS * PARTS.index(space))
@@ -138,12 +140,12 @@ def _count_generic(
 def support_text() -> str:
     """LLVM text of the counting functions: ``(addresses, displacement, mask, counters, sites, element bytes)``.
 
-    They return what a site's request takes of shared memory: wavefronts, or rounds of an atomic; 0 elsewhere.
+    They return what a site's request takes of shared memory, as ``count_sites`` says; 0 elsewhere.
     """
     functions: list[_Function] = [
         _global_function("count_global", atomic=False),
         _global_function("count_atomics", atomic=True),
-        _shared_atomics_function(),
+        *(_shared_atomics_function(width) for width in (4, 8)),
         *(_shared_function(width) for width in (4, 8, 16)),
         _local_function(),
     ]
@@ -261,6 +263,16 @@ def _multiplicity(f: _Function, keys: str) -> str:
     return count
 
 
+def _turns(f: _Function, keys: str) -> str:
+    """How many earlier lanes have this lane's key."""
+    w = f.w
+    count = w.splat_int("i32", 0)
+    for by in range(1, WARP):
+        same = w.binary("and", "i1", w.compare("icmp eq", "i32", keys, f.rotated("i32", keys, by)), f.earlier(by))
+        count = w.binary("sub", "i32", count, w.cast("sext", same, "i1", "i32"))
+    return count
+
+
 def _active_bits(f: _Function, predicate: str) -> str:
     w = f.w
     return w.value(f"and i32 {w.value(f'bitcast <32 x i1> {predicate} to i32')}, %mask")
@@ -328,27 +340,75 @@ def _last_label(w: Writer, before: str) -> str:
     return labels[labels.index(before) - 1]
 
 
-def _shared_atomics_function() -> _Function:
-    """Requests, lanes, and the largest number of lanes on one address."""
-    f = _Function("count_shared_atomics")
+def _shared_atomics_function(width: int) -> _Function:
+    """Requests, lanes, rounds (one lane per word in each: the largest number of lanes on one), and the
+    wavefronts of those rounds, in each of the lanes that are not served yet.
+
+    -> rounds, and from bit 32 on wavefronts.
+    """
+    f = _Function(f"count_shared_atomics_{width}")
     w = f.w
-    keys = _narrow(f, f.addresses())
-    counts = w.select("i32", f.lanes(), _multiplicity(f, keys), w.splat_int("i32", 0))
+    group = WARP * 4 // width
+    units = 32 * 4 // width
+    unit = w.binary("lshr", "i64", f.addresses(), w.splat_int("i64", width.bit_length() - 1))
+    keys = _narrow(f, unit)
+    turns = w.select("i32", f.lanes(), _turns(f, keys), w.splat_int("i32", 0))
     w.declare("declare i32 @llvm.vector.reduce.umax.v32i32(<32 x i32>)")
-    largest = w.value(f"call i32 @llvm.vector.reduce.umax.v32i32(<32 x i32> {counts})")
-    f.result = wide = w.value(f"zext i32 {largest} to i64")
+    last = w.value(f"call i32 @llvm.vector.reduce.umax.v32i32(<32 x i32> {turns})")
+    largest = w.value(f"add i32 {last}, 1")
+    banks = w.binary("and", "i32", w.cast("trunc", unit, "i64", "i32"), w.splat_int("i32", units - 1))
+    firsts = _firsts(f, keys, group)
+    before = _last_label_of(w)
+    w.emit("br label %round")
+    w.label("round")
+    w.emit(f"%served = phi i32 [ 0, %{before} ], [ %served.next, %round ]")
+    w.emit(f"%waves = phi i32 [ 0, %{before} ], [ %waves.next, %round ]")
+    # Of the lanes of a group that still want a word, the first one: it is served now, or an earlier group's lane is.
+    now = w.compare("icmp eq", "i32", turns, w.splat("i32", "%served"))
+    later = w.binary("and", "i1", firsts, w.compare("icmp ugt", "i32", turns, w.splat("i32", "%served")))
+    leaders = w.binary("and", "i1", w.binary("or", "i1", now, later), f.lanes())
+    w.emit(f"%waves.next = add i32 %waves, {_bank_passes(f, leaders, banks, group)}")
+    w.emit("%served.next = add i32 %served, 1")
+    again = w.value(f"icmp ult i32 %served.next, {largest}")
+    w.emit(f"br i1 {again}, label %round, label %counted")
+    w.label("counted")
+    rounds, wide = (w.value(f"zext i32 {each} to i64") for each in (largest, "%waves.next"))
+    f.result = w.value(f"or i64 {rounds}, {w.value(f'shl i64 {wide}, 32')}")
     lanes = f.count_bits("%mask")
-    came_from = _last_label_of(w)
     w.emit("br label %copy")
     w.label("copy")
-    w.emit(f"%site = phi i64 [ 0, %{came_from} ], [ %site.next, %copy ]")
-    for word, amount in enumerate(("1", lanes, wide)):
+    w.emit("%site = phi i64 [ 0, %counted ], [ %site.next, %copy ]")
+    for word, amount in enumerate(("1", lanes, rounds, wide)):
         f.add(word, amount, "%site")
     w.emit("%site.next = add i64 %site, 1")
     more = w.value("icmp ult i64 %site.next, %sites")
     w.emit(f"br i1 {more}, label %copy, label %all")
     w.label("all")
     return f
+
+
+def _bank_passes(f: _Function, leaders: str, banks: str, group: int) -> str:
+    """i32: per group of lanes the largest number of leaders, one a word, in one bank, summed."""
+    w = f.w
+    one = w.cast("zext", leaders, "i1", "i32")
+    words = one
+    for by in range(1, group):
+        same = w.compare("icmp eq", "i32", banks, f.rotated("i32", banks, by, group))
+        words = w.binary(
+            "add",
+            "i32",
+            words,
+            w.select("i32", same, f.rotated("i32", one, by, group), w.splat_int("i32", 0)),
+        )
+    words = w.select("i32", leaders, words, w.splat_int("i32", 0))
+    by = group // 2
+    while by:
+        words = w.intrinsic("llvm.umax", "i32", words, f.rotated("i32", words, by, group))
+        by //= 2
+    heads = "<" + ", ".join(f"i1 {'true' if lane % group == 0 else 'false'}" for lane in range(WARP)) + ">"
+    kept = w.select("i32", heads, words, w.splat_int("i32", 0))
+    w.declare("declare i32 @llvm.vector.reduce.add.v32i32(<32 x i32>)")
+    return w.value(f"call i32 @llvm.vector.reduce.add.v32i32(<32 x i32> {kept})")
 
 
 def _last_label_of(w: Writer) -> str:
@@ -369,25 +429,7 @@ def _shared_function(width: int) -> _Function:
     keys = _narrow(f, unit)
     banks = w.binary("and", "i32", w.cast("trunc", unit, "i64", "i32"), w.splat_int("i32", units - 1))
     leaders = w.binary("and", "i1", _firsts(f, keys, group), f.lanes())
-    one = w.cast("zext", leaders, "i1", "i32")
-    words = one
-    for by in range(1, group):
-        same = w.compare("icmp eq", "i32", banks, f.rotated("i32", banks, by, group))
-        words = w.binary(
-            "add",
-            "i32",
-            words,
-            w.select("i32", same, f.rotated("i32", one, by, group), w.splat_int("i32", 0)),
-        )
-    words = w.select("i32", f.lanes(), words, w.splat_int("i32", 0))
-    by = group // 2
-    while by:
-        words = w.intrinsic("llvm.umax", "i32", words, f.rotated("i32", words, by, group))
-        by //= 2
-    heads = "<" + ", ".join(f"i1 {'true' if lane % group == 0 else 'false'}" for lane in range(WARP)) + ">"
-    kept = w.select("i32", heads, words, w.splat_int("i32", 0))
-    w.declare("declare i32 @llvm.vector.reduce.add.v32i32(<32 x i32>)")
-    total = w.value(f"call i32 @llvm.vector.reduce.add.v32i32(<32 x i32> {kept})")
+    total = _bank_passes(f, leaders, banks, group)
     f.add(0, "1")
     f.add(1, f.count_bits("%mask"))
     f.result = w.value(f"zext i32 {total} to i64")

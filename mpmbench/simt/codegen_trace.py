@@ -41,21 +41,28 @@ def advance_clock(g: _Generator, number: int) -> None:
 def take_shared(g: _Generator, sites: Sequence[Site], taken: str) -> None:
     """A request of shared memory takes its pipe and keeps the warp longer than one without conflicts.
 
-    taken: i64, wavefronts or rounds of one site; 0 if no lane takes part. Float atomics are compare-and-swap loops: a
-    round loads, adds and swaps, which takes the pipe three times.
+    taken: i64 as ``count_sites`` gives it; 0 if no lane takes part. Float atomics are compare-and-swap loops: a round
+    loads, adds and swaps, which takes the pipe three times.
     """
     w, first = g.w, sites[0]
     item = g.kernel.instructions[first.index]
     is_loop = first.kind == "atomic" and item.modifiers[-1] in ("f32", "f64")
-    passes = len(sites) * (CAS_PASSES if is_loop else 1)
-    _add(g, scheduler.CONTEXT_SHARED, w.value(f"mul i64 {taken}, {passes}"))
+    passes = CAS_PASSES if is_loop else 1
+    rounds = waves = taken
+    if first.kind == "atomic":
+        rounds, waves = w.value(f"and i64 {taken}, {0xFFFFFFFF}"), w.value(f"lshr i64 {taken}, 32")
+    _add(g, scheduler.CONTEXT_SHARED, w.value(f"mul i64 {waves}, {passes * len(sites)}"))
     w.declare("declare i64 @llvm.usub.sat.i64(i64, i64)")
-    more = w.value(f"call i64 @llvm.usub.sat.i64(i64 {taken}, i64 1)")
     if is_loop:
         slots = w.value(f"mul i64 {g.job_field('cas_issue')}, {len(sites)}")
-        _add(g, scheduler.CONTEXT_ISSUE, w.value(f"mul i64 {taken}, {slots}"))
-    cycles = g.job_field("cas_trip") if is_loop else "1"
-    _add(g, scheduler.CONTEXT_CLOCK, w.value(f"mul i64 {w.value(f'mul i64 {more}, {cycles}')}, {len(sites)}"))
+        _add(g, scheduler.CONTEXT_ISSUE, w.value(f"mul i64 {rounds}, {slots}"))
+        more = w.value(f"call i64 @llvm.usub.sat.i64(i64 {rounds}, i64 1)")
+        conflicts = w.value(f"mul i64 {w.value(f'sub i64 {waves}, {rounds}')}, {passes}")
+        trips = w.value(f"mul i64 {more}, {g.job_field('cas_trip')}")
+        cycles = w.value(f"add i64 {trips}, {conflicts}")
+    else:
+        cycles = w.value(f"call i64 @llvm.usub.sat.i64(i64 {waves}, i64 1)")
+    _add(g, scheduler.CONTEXT_CLOCK, w.value(f"mul i64 {cycles}, {len(sites)}"))
 
 
 def _add(g: _Generator, field: int, amount: str) -> None:

@@ -35,7 +35,8 @@ class Tally:
     # 8 lanes; per group the largest number of distinct words that fall in one of the 32 banks
     satom_req: int = 0  # shared atomic requests
     satom_lane: int = 0
-    satom_iter: int = 0  # largest same-address multiplicity per request, summed (trips of a CAS loop)
+    satom_iter: int = 0  # largest same-word multiplicity per request, summed (trips of a CAS loop)
+    satom_wavefronts: int = 0  # of those trips, each of the lanes that still want their word: as shm_wavefronts
     lld_req: int = 0  # local-memory (per-thread array) load requests
     lst_req: int = 0
     bar: int = 0  # block-barrier arrivals, per warp

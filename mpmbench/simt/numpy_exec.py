@@ -672,7 +672,7 @@ class _Decoder:
             pieces = warp.block.launch.memory.locate(address(warp), lanes, size, space)
             if any(piece.space not in ("global", "shared") for piece in pieces):
                 raise FaultError("out-of-bounds", f"{item.opcode} of memory that is neither global nor shared")
-            memory.count_atomic(tally(warp), pieces)
+            memory.count_atomic(tally(warp), pieces, dtype.itemsize)
             values = [np.stack([read(warp) for read in elements], axis=1) for elements in operands]
 
             def new(old: Array, chosen: Array, where: str) -> Array:

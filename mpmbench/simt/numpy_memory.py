@@ -162,8 +162,8 @@ def count_store(tally: Tally, pieces: list[Piece], size: int) -> None:
             tally.lst_req += 1
 
 
-def count_atomic(tally: Tally, pieces: list[Piece]) -> None:
-    for space, at, _ in _by_space(pieces):
+def count_atomic(tally: Tally, pieces: list[Piece], size: int) -> None:
+    for space, at, lanes in _by_space(pieces):
         words, times = np.unique(at, return_counts=True)
         if space == "global":
             tally.gatom_req += 1
@@ -174,7 +174,11 @@ def count_atomic(tally: Tally, pieces: list[Piece]) -> None:
         elif space == "shared":
             tally.satom_req += 1
             tally.satom_lane += len(at)
-            tally.satom_iter += int(times.max())
+            words = at // max(4, size)  # half words take turns at the word that they share
+            turns = np.array([np.count_nonzero(words[:i] == words[i]) for i in range(len(at))])
+            tally.satom_iter += int(turns.max()) + 1
+            for turn in range(int(turns.max()) + 1):
+                tally.satom_wavefronts += _wavefronts(at[turns >= turn], lanes[turns >= turn], size)
 
 
 def _by_space(pieces: list[Piece], const_is_global: bool = False) -> Iterable[tuple[str, Array, Array]]:

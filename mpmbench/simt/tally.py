@@ -21,7 +21,7 @@ _SITE_FIELDS: dict[tuple[str, str], tuple[str | None, ...]] = {
     ("atomic", "global"): ("gatom_req", "gatom_lane", "gatom_sectors", "gatom_pass"),
     ("load", "shared"): ("sld_req", None, "shm_wavefronts", None),
     ("store", "shared"): ("sst_req", None, "shm_wavefronts", None),
-    ("atomic", "shared"): ("satom_req", "satom_lane", "satom_iter", None),
+    ("atomic", "shared"): ("satom_req", "satom_lane", "satom_iter", "satom_wavefronts"),
     ("load", "local"): ("lld_req", None, None, None),
     ("store", "local"): ("lst_req", None, None, None),
     ("atomic", "local"): (None, None, None, None),

@@ -171,8 +171,32 @@ def test_shared_atomics():
     out = np.zeros(8, I32)
     tally = count(body, 1, 64, out)
     assert (tally.satom_req, tally.satom_lane, tally.satom_iter) == (2, 64, 7 + 7)
+    assert tally.satom_wavefronts == 7 + 7
     assert tally.bar == 4
     assert tally.gatom_req == 0
+
+
+@pytest.mark.parametrize(("kind", "width"), [("float", 4), ("double", 8)])
+def test_shared_atomics_wavefronts_by_brute_force(kind, width):
+    """In each round the lanes that are not served yet pass by the banks of their words, 8-byte ones in two halves."""
+    rng = np.random.default_rng(6)
+    body = f"""(const int* to, {kind}* out) {{ __shared__ {kind} s[512]; int t = threadIdx.x;
+        for (int i = t; i < 512; i += 32) s[i] = 0;
+        __syncthreads(); if (to[t] >= 0) atomicAdd(&s[to[t]], ({kind})1);
+        __syncthreads(); out[t] = s[t]; }}"""
+    cases = [np.arange(32), 4 * np.arange(32), np.arange(32) // 5 * 32, np.full(32, 7), rng.integers(0, 12, 32)]
+    cases += [rng.integers(0, 512, 32), np.where(rng.random(32) < 0.4, rng.integers(0, 40, 32), -1)]
+    for to in cases:
+        tally = count(body, 1, 32, to.astype(I32), np.zeros(32, np.dtype(kind if kind == "double" else "float32")))
+        turn = np.array([np.count_nonzero(to[:lane] == to[lane]) for lane in range(32)])
+        want = 0
+        for served in range(1 + turn[to >= 0].max()):
+            waiting = (turn >= served) & (to >= 0)
+            for half in np.split(np.arange(32), width // 4):
+                words = np.unique(to[half][waiting[half]]) * (width // 4)
+                want += np.bincount(words % 32).max(initial=0)
+        assert tally.satom_iter == 1 + turn[to >= 0].max()
+        assert tally.satom_wavefronts == want
 
 
 def test_local_and_generic_accesses():

@@ -424,7 +424,17 @@ def test_global_requests_sectors_and_atomic_passes(body, expected):
         ("__shared__ float4 s[2]; s[i & 1] = make_float4(x[0], 1, 2, 3); __syncthreads(); float4 v = s[0]; "
          "x[i] = v.x + v.y + v.z + v.w;", {"sst_req": 1, "sld_req": 1, "shm_wavefronts": 4 + 4}),
         ("volatile __shared__ unsigned char s[64]; s[i] = 1;", {"sst_req": 1, "shm_wavefronts": 1}),
-        ("__shared__ float s[8]; atomicAdd(s + i % 8, 1.0f);", {"satom_req": 1, "satom_lane": 32, "satom_iter": 4}),
+        ("__shared__ float s[8]; atomicAdd(s + i % 8, 1.0f);",
+         {"satom_req": 1, "satom_lane": 32, "satom_iter": 4, "satom_wavefronts": 4}),
+        # One word in each lane's bank; four words in each of eight banks.
+        ("__shared__ float s[32]; atomicAdd(s + i, 1.0f);", {"satom_iter": 1, "satom_wavefronts": 1}),
+        ("__shared__ float s[128]; atomicAdd(s + 4 * i, 1.0f);", {"satom_iter": 1, "satom_wavefronts": 4}),
+        # Lanes 0 to 15 each want a word of bank 0, two lanes a word: 8 words, then the 8 of the lanes that lost.
+        ("__shared__ float s[512]; if (i < 16) atomicAdd(s + i / 2 * 32, 1.0f);",
+         {"satom_lane": 16, "satom_iter": 2, "satom_wavefronts": 8 + 8}),
+        # 8-byte words pass in two halves of the warp. Lane 31 wants lane 0's word: its half has two words in bank 0,
+        # and a second round has it alone.
+        ("__shared__ double s[64]; atomicAdd(s + i % 31, 1.0);", {"satom_iter": 2, "satom_wavefronts": 1 + 2 + 1}),
         ("__syncwarp(); __syncthreads(); __syncthreads();", {"bar": 2, "bar_warp": 1}),
     ],
 )  # fmt: skip
