@@ -70,6 +70,13 @@ def test_lengths_around_powers_of_two_are_exact(device, name: str, integers) -> 
         assert total_of(bench, integers[:length]) == integers[:length].sum(dtype=np.int64), length
 
 
+@pytest.mark.parametrize("threads", [1024, 64, 32])
+def test_threads_that_stay_at_their_places_are_exact(device, threads: int, integers) -> None:
+    bench = bench_of(device, "reduce_interleaved", index="remainder", threads=threads)
+    for length in (0, 1, 31, 33, 1023, 1025, 4099):
+        assert total_of(bench, integers[:length]) == integers[:length].sum(dtype=np.int64), length
+
+
 @pytest.mark.parametrize("loads", [2, 16, 256])
 def test_sequential_loads_are_exact(device, loads: int, integers) -> None:
     bench = bench_of(device, "reduce_sequential", loads=loads)
@@ -173,6 +180,20 @@ def test_wavefronts_follow_from_addresses(counting, name: str, accesses, threads
     total = counters.total
     assert (total.sld_req + total.sst_req, total.shm_wavefronts) == (requests, expected)
     assert (expected == requests) == (name == "reduce_sequential")
+
+
+def test_a_remainder_shares_no_bank_and_keeps_every_warp_in_every_step(counting, integers) -> None:
+    """Harris's first kernel: each warp takes all ten steps, from the sixth on ever fewer have work in them."""
+    values = integers[:1024].astype(np.float32)[:, None]
+    axes = {"element": "float", "operator": "identity_add"}
+    strided, remainder = (
+        run_on(counting, get("reduce_interleaved"), values, index=index, **axes)[1].total
+        for index in ("strided", "remainder")
+    )
+    assert remainder.shm_wavefronts == remainder.sld_req + remainder.sst_req
+    # The store before the tree, three accesses a step by the warps with a worker, and the load of the result.
+    assert remainder.sld_req + remainder.sst_req == 32 + 3 * (5 * 32 + 16 + 8 + 4 + 2 + 1) + 1
+    assert remainder.warp_inst > 2 * strided.warp_inst
 
 
 @pytest.mark.parametrize("element", reduce.ELEMENTS)

@@ -195,7 +195,7 @@ def test_wavefronts_of_the_tree_follow_from_addresses(counting, threads: int, pa
 def test_raking_has_no_conflicts_and_fewer_barriers(counting, loads: int, values) -> None:
     length = 2**14
     _, tree = run_on(counting, get("scan_interleaved"), values[:length])
-    _, raking = run_on(counting, get("scan_sequential"), values[:length], loads=loads)
+    _, raking = run_on(counting, get("scan_sequential"), values[:length], loads=loads, padding="full")
     total = raking.total
     assert total.shm_wavefronts == total.sld_req + total.sst_req
     assert total.lld_req == 0, "unrolled values stay in registers"

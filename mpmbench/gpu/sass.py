@@ -120,7 +120,8 @@ def _integer(root: str, modifiers: list[str], kind: str, maxwell: bool, literal:
             return "int_mul", 16.0 if maxwell else 5.0
         return "int_mul", (3.0 if literal is None else 2.0) if maxwell else 1.0
     if root in ("div", "rem"):
-        return "int_add", 150.0 if long else (30.0 if maxwell else 20.0)
+        signed = kind[0] == "s"
+        return "int_add", 150.0 if long else (33.0 if signed else 29.0) if maxwell else (23.0 if signed else 17.0)
     if root in ("add", "sub", "neg", "abs", "addc", "subc"):
         if long and literal is not None:  # the offset in a load or store
             return "int_add", 0.0

@@ -120,6 +120,8 @@ def pyramid(bench: Bench) -> Built:
     axes, group, loads = bench.axes, bench.axes["threads"], bench.axes.get("loads", 1)
     unary, binary = axes["operator"].split("_")
     shape: dict[str, Any] = {"BINARY": binary.capitalize(), "GROUP": group, "LOADS": loads, "REACH": REACH}
+    if "index" in axes:
+        shape["STRIDED"] = axes["index"] == "strided"
     level: dict[str, Any] = element_constants(axes["element"]) | {"UNARY": _UNARY[unary]}
     above = element_constants(value_element(axes)) | {"UNARY": "Identity"}
     count, source = bench.size, bench.upload(bench.inputs["values"])

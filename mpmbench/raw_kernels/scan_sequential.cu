@@ -1,29 +1,39 @@
-// Idea: raking. Each thread first scans LOADS neighbouring values on its own and hands only their sum to the tree in
-// shared memory, then spreads what the tree says over its values.
-// A thread block owns GROUP * LOADS values; a thread owns LOADS neighbouring ones and one leaf of the tree.
+// Idea: raking. A leaf of the tree in shared memory is the sum of LOADS neighbouring values, which one thread scans on its
+// own; then it spreads what the tree says over them. The tree is that of scan_interleaved: two leaves per thread.
+// A thread block owns 2 * GROUP * LOADS values; a thread owns LOADS neighbouring ones at each of two leaves, GROUP apart.
 // Constants: LOADS, UNROLL (LOADS to unroll the loops over them, 1 to keep them rolled: the values then lie in local
-// memory), and those of scan_tree.cuh and scan.cuh. Shared memory: one integer per thread, and the padding.
+// memory), and those of scan_tree.cuh and scan.cuh. Shared memory: one integer per leaf, and the padding.
 #include "scan_tree.cuh"
 
 extern "C" __global__ void __launch_bounds__(GROUP) scan_sequential(
     const int count, const int* __restrict__ values, int* __restrict__ scanned, int* __restrict__ segment_sums) {
-    __shared__ int tile[padded(GROUP - 1) + 1];
+    constexpr int LEAVES = 2 * GROUP;
+    __shared__ int tile[padded(LEAVES - 1) + 1];
 
     const int t = threadIdx.x;
-    const int first = (blockIdx.x * GROUP + t) * LOADS;
-    int before[LOADS];
-    int sum = 0;
+    int before[2][LOADS];
+#pragma unroll
+    for (int half = 0; half < 2; ++half) {
+        const int leaf = t + half * GROUP;
+        const int first = (blockIdx.x * LEAVES + leaf) * LOADS;
+        int sum = 0;
 #pragma unroll UNROLL
-    for (int j = 0; j < LOADS; ++j) {
-        before[j] = sum;
-        sum += value_at(values, count, first + j);
+        for (int j = 0; j < LOADS; ++j) {
+            before[half][j] = sum;
+            sum += value_at(values, count, first + j);
+        }
+        tile[padded(leaf)] = sum;
     }
-    tile[padded(t)] = sum;
-    const int total = tree_scan<GROUP>(tile);
+    const int total = tree_scan<LEAVES>(tile);
     if (t == 0) segment_sums[blockIdx.x] = total;
-    const int before_thread = tile[padded(t)];
+#pragma unroll
+    for (int half = 0; half < 2; ++half) {
+        const int leaf = t + half * GROUP;
+        const int first = (blockIdx.x * LEAVES + leaf) * LOADS;
+        const int before_leaf = tile[padded(leaf)];
 #pragma unroll UNROLL
-    for (int j = 0; j < LOADS; ++j) {
-        if (first + j < count) scanned[first + j] = before_thread + before[j];
+        for (int j = 0; j < LOADS; ++j) {
+            if (first + j < count) scanned[first + j] = before_leaf + before[half][j];
+        }
     }
 }
