@@ -165,6 +165,10 @@ def test_one_wrong_figure_misses_one_target(gpu) -> None:
     found = judge(rows)
     missed = {t.name.split(" ")[0]: t.detail for t in targets(found, score(found), gpu) if not t.met}
     assert missed == {"DRAM": "table 13, global: 1.10x", "occupancy": "table 15, P2G-Sync: +2.7"}
+    rows = [replace(one, floor_bytes=2 * 10**10 if one.row == "global" else 1) for one in rows]
+    found = judge(rows)
+    (detail,) = (t.detail for t in targets(found, score(found), gpu) if t.name.startswith("DRAM"))
+    assert detail == ("table 13, global: 1.10x (printed is less than must move in table 13, global, table 14, global)")
 
 
 def test_targets_leave_out_other_kernels_and_batched_ones(gpu) -> None:
@@ -203,7 +207,10 @@ def test_likely_causes_by_terms_counters_and_stall(gpu) -> None:
     assert "L. Scoreb.(95.1%), is a wait for global memory" in cause(50, **stalled)
     assert "Scoreb" not in cause(50, bound="dram", **stalled)
     bytes_off = {"published": {"vram_percent": "50"}, "metrics": {"dram_bytes": 5e6}}
-    assert "5 MB counted, 11 MB by the printed" in cause(50, **bytes_off)
+    assert "5 MB counted, 11 MB by the printed VRAM share times the time." in cause(50, **bytes_off)
+    assert "11 MB by the printed VRAM share times the time, which is less than the 12 MB" in cause(
+        50, **bytes_off, floor_bytes=12_000_000
+    )
     assert likely_cause(Judged(row(ours=None, failed="no memory"), "comparable", ""), gpu) == (
         "No modelled time: no memory."
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 from mpmbench.gpu import Gpu
 from mpmbench.gpu.modelled import TERM_WORDS, TERMS, ModelledTime
 from mpmbench.reproduce.comparable import Judged
-from mpmbench.reproduce.targets import BYTES, implied_bytes
+from mpmbench.reproduce.targets import BYTES, implied_bytes, prints_less_than_moves
 
 PATH = Path(__file__).with_name("causes.toml")
 
@@ -42,9 +42,10 @@ def likely_cause(judged: Judged, gpu: Gpu) -> str:
         sentences.append(_by_terms(row.modelled, row.published_us, judged.ratio))
     implied, ours = implied_bytes(row, gpu), row.metrics.get("dram_bytes")
     if implied and ours is not None and abs(ours / implied - 1) > BYTES:
-        sentences.append(
-            f"DRAM: {ours / 1e6:,.0f} MB counted, {implied / 1e6:,.0f} MB by the printed VRAM share times the time."
-        )
+        text = f"DRAM: {ours / 1e6:,.0f} MB counted, {implied / 1e6:,.0f} MB by the printed VRAM share times the time"
+        if prints_less_than_moves(row, gpu):
+            text += f", which is less than the {(row.floor_bytes or 0) / 1e6:,.0f} MB that each input and result are"
+        sentences.append(f"{text}.")
     sentences.append(_by_stall(row.published.get("top_stall", ""), row.modelled.bound))
     return " ".join(filter(None, sentences))
 

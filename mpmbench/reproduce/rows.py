@@ -32,7 +32,7 @@ Progress = Callable[[str, int, int], None]  # (what runs, steps done, steps in a
 # The published rows of these tables time one dispatch and leave partial results; ours go on to one result.
 FIRST_LAUNCH_TABLES = (7, 8)
 
-FORM = "1"  # of what the cache keeps of a row: another one counts anew
+FORM = "2"  # of what the cache keeps of a row: another one counts anew
 
 CHUNK = 4  # rows that one process counts in a row, so that a dataset is made once
 
@@ -50,7 +50,8 @@ class Row:
 
     row, place: the printed name, and where in its table it stands.  published: the other printed figures, as printed
     (vram_percent, sm_percent, l2_percent, l2_hit_percent, top_stall, occupancy_warps, ...).  metrics: the counted and
-    modelled counterparts under the same names, and dram_bytes.  kernel_hash: of the sources of all its launches.
+    modelled counterparts under the same names, and dram_bytes.  floor_bytes: what must cross global memory, each input
+    and result once.  kernel_hash: of the sources of all its launches.
     failed: why there is no modelled time.  state: what ``retime`` needs; opaque.
     """
 
@@ -65,6 +66,7 @@ class Row:
     kernel_hash: str
     dataset_fingerprint: str
     failed: str | None = None
+    floor_bytes: int | None = None
     state: Any = field(default=None, repr=False, compare=False)
 
     @property
@@ -177,6 +179,7 @@ def _row(case: Any, gpu: Gpu, chosen: Gpu, found: Mapping[str, Any]) -> Row:
         found["kernel_hash"],
         found["fingerprint"],
         found["failed"] or None,
+        found["floor_bytes"],
         None if found["failed"] else State(gpu, launches),
     )
     if found["failed"]:
@@ -261,6 +264,7 @@ def _count_case(case: Case | PrimitiveCase, gpu: Gpu) -> dict[str, Any]:
         "launches": [_plain(launch) for launch in launches],
         "kernel_hash": disk.content_key(*(f"{name} {sha}" for name, sha in sorted(record.hashes.items()))),
         "fingerprint": record.dataset.fingerprint,
+        "floor_bytes": record.floor_bytes,
         "failed": failed,
     }
 
