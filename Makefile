@@ -8,7 +8,7 @@ BIN    := $(VENV)/bin
 .PHONY: help demo test test-all bench lint clean
 
 help:
-	@echo "make demo      run every strategy on three datasets, leave reports/demo/report.html"
+	@echo "make demo      run every strategy on three datasets, leave reports/demo/report.html, and modelled on two GPUs gpus.html"
 	@echo "make test      install and run the tests, the linter and the type checker (some 12 minutes the first time)"
 	@echo "make test-all  the full product of axes on top; resumable"
 	@echo "make bench     engine against native CPU code, NVIDIA Warp and Taichi (CPU wall clock)"
@@ -21,6 +21,7 @@ $(VENV)/.installed: pyproject.toml
 
 demo: $(VENV)/.installed
 	$(BIN)/mpmbench run --preset demo --json reports/demo/records.jsonl --html reports/demo/report.html --md reports/demo/report.md
+	$(BIN)/mpmbench run --gpu h100,rtx4090 --dataset random --dataset uniform_cube --particles 200_000 --json reports/demo/gpus.jsonl --html reports/demo/gpus.html
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .

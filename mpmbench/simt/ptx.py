@@ -380,7 +380,8 @@ class _Parser:
             family = re.match(r"%[A-Za-z_$]+", name)
             if family and family.group() in families:
                 return scopes[0].setdefault(name, Reg(name, families[family.group()]))
-            raise InputError(f"PTX: undeclared register {name} in {function.name}")
+            where = f"{line.file}:{line.line}" if line else function.name
+            raise InputError(f"PTX: register {name} at {where} is not declared, and no special one that is supported")
 
         for statement in self.statements:
             if statement == "{":
