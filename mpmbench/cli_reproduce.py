@@ -82,7 +82,7 @@ def thesis(
     if freeze is not None:
         path, version = frozen.freeze(freeze, reason, gpu.name, constants, judged)
         _say(f"froze {len(version.constants)} constants and {len(judged)} rows as {freeze}: {path}")
-        _say(f"write {version.note}: what changed, why, and what the score was before; then run without --freeze")
+        _say(f"{version.note} says what changed, why, and the score before: write it, then run without --freeze")
         return
     total = score(judged)
     differs = frozen.differences(frozen.newest(), gpu.name, constants, judged)

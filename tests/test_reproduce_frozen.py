@@ -32,7 +32,8 @@ def test_a_version_reads_back_as_written(folder, judged) -> None:
     assert one.rows[9, "Random"].reason == "calibrated: sets the rate of DRAM row activations"
     assert one.rows[13, "global"].comparable
     assert one.rows[13, "global"].kernel_hash == "hash-p2g_global_atomic"
-    assert one.note.endswith("-freeze-v1.md")
+    assert one.note == "docs/decisions/007-freeze-v1.md", "the decision that is there"
+    assert frozen.note_name("v99").endswith("-freeze-v99.md")
     assert frozen.differences(one, "gtx970", CONSTANTS, judged) == []
     text = (folder / "v1.json").read_text()
     assert len(text.splitlines()) < 80, "one line per row and constant"

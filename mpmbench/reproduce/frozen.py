@@ -150,7 +150,9 @@ def stamp(frozen: Frozen | None, differs: Sequence[str]) -> dict[str, Any]:
 
 
 def note_name(version: str, folder: Path = DECISIONS) -> str:
-    """Path of the decision that a freeze asks for, with the next free number."""
+    """Path of the decision that explains a freeze: the one that is there, or one with the next free number."""
+    for path in folder.glob(f"[0-9][0-9][0-9]-freeze-{version}.md"):
+        return f"docs/decisions/{path.name}"
     numbers = [int(path.name[:3]) for path in folder.glob("[0-9][0-9][0-9]-*.md")]
     return f"docs/decisions/{max(numbers, default=0) + 1:03}-freeze-{version}.md"
 
