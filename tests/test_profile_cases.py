@@ -139,7 +139,8 @@ def test_counts_survive_the_cache(copied):
 def test_a_row_that_fails_has_no_time():
     found = next(c for c in presets.thesis() if c.preset_row["table"] == 5)
     gpu = get_gpu("gtx970")
-    row = rows._row(found, gpu, gpu, {"launches": [], "kernel_hash": "", "fingerprint": "", "failed": "broken"})
+    counts = {"launches": [], "kernel_hash": "", "fingerprint": "", "floor_bytes": None, "failed": "broken"}
+    row = rows._row(found, gpu, gpu, counts)
     assert (row.modelled, row.failed) == (None, "broken")
     assert rows.retime([row], gpu.constants) == [row]
 
