@@ -100,7 +100,7 @@ def test_registers_of_an_inner_scope_are_its_own():
 
 
 def test_an_undeclared_register_or_symbol_is_refused():
-    with pytest.raises(InputError, match="register %x at .* is not declared"):
+    with pytest.raises(InputError, match=r"register %x at .* is not declared"):
         parse("mov.u32 %x, 1;")
     with pytest.raises(InputError, match="unknown symbol nowhere"):
         parse("mov.u64 %rd1, nowhere;")
