@@ -11,6 +11,7 @@ import json
 import os
 import signal
 import sys
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -19,6 +20,7 @@ from typing import Any
 
 import click
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table as RichTable
 
@@ -34,6 +36,10 @@ INTERRUPTED = 130
 
 class _Group(click.Group):
     """Turns every error that a user can mend into one line and an exit code."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        ctx.meta["given"] = tuple(args)
+        return super().parse_args(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
@@ -51,10 +57,10 @@ class _Group(click.Group):
             notes.print("mpmbench: out of memory: take fewer particles (--particles) or a smaller grid", soft_wrap=True)
             ctx.exit(1)
         except KeyboardInterrupt:
-            notes.print(
-                "mpmbench: interrupted; what is in --json FILE is whole, run --resume goes on from there",
-                soft_wrap=True,
-            )
+            given = ctx.meta["given"]
+            kept = given[0] == "run" and any(word.split("=")[0] == "--json" for word in given)
+            more = "; what is in --json FILE is whole, run --resume goes on from there" if kept else ""
+            notes.print(f"mpmbench: interrupted{more}", soft_wrap=True)
             ctx.exit(INTERRUPTED)
 
 
@@ -344,7 +350,7 @@ def list_command(variant_dirs: Sequence[Path], as_json: bool) -> None:
     ):
         table = RichTable("name", "what it is", title=title, title_justify="left", box=None, padding=(0, 2, 0, 0))
         for name, summary in rows:
-            table.add_row(name, summary)
+            table.add_row(escape(name), escape(summary))
         console.print(table)
         console.print()
     _print_axes("Axes", [(v.name, v.axes) for v in variants])
@@ -761,8 +767,12 @@ def _write_whole(path: Path, text: str) -> None:
     os.replace(partial, path)
 
 
+_READ_ONLY = (".npz", ".npy", ".toml", ".cu", ".cuh", ".py")
+
+
 def _refuse_targets(paths: Sequence[Path | None], inputs: Iterable[str | Path] = ()) -> None:
-    """Refuse to write into a folder or a device, to write two things into one file, or over what is read."""
+    """Refuse to write into a folder or a device, where nothing can be written, two things into one file, over what is
+    read, and over particles or sources."""
     taken = {Path(path).resolve(): "is read by the same command" for path in inputs}
     for path in filter(None, paths):
         if path.is_dir():
@@ -771,7 +781,21 @@ def _refuse_targets(paths: Sequence[Path | None], inputs: Iterable[str | Path] =
             raise InputError(f"{path} is not an ordinary file: name another one")
         if problem := taken.get(path.resolve()):
             raise InputError(f"{path} {problem}: name another file to write to")
+        if path.exists() and path.suffix in _READ_ONLY:
+            raise InputError(f"{path} exists and is none that mpmbench writes: name another file to write to")
+        _try_to_write(path)
         taken[path.resolve()] = "is written by the same command"
+
+
+def _try_to_write(path: Path) -> None:
+    """Learn before the work, not after it, that a file cannot be written. Creates nothing that stays."""
+    folder = next(parent for parent in path.resolve().parents if parent.exists())
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise InputError(f"{path} cannot be written: {folder}: {reason}") from None
 
 
 def _write_reports(

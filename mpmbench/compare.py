@@ -186,7 +186,7 @@ def _refuse_without_times(rows: Sequence[Row]) -> None:
         return
     reason, _ = Counter(row.without_time for row in rows).most_common(1)[0]
     raise InputError(
-        f"{rows[0].path} holds no measured time ({len(rows)} rows; {reason}): compare files of a run on a GPU (-d cuda)"
+        f"{rows[0].path} holds no measured time ({len(rows)} rows; {reason}): compare timed runs (-d cuda, -d cpu)"
     )
 
 

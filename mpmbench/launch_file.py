@@ -83,7 +83,9 @@ def read_launch_file(path: Path) -> LaunchFile:
     """Read and check; the first problem is an InputError of one line that names file and key."""
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as problem:
+    except OSError as problem:
+        raise InputError(f"cannot read {path}: {(problem.strerror or str(problem)).lower()}") from problem
+    except UnicodeDecodeError as problem:
         raise InputError(f"cannot read {path}: {problem}") from problem
     except tomllib.TOMLDecodeError as problem:
         raise InputError(f"{path}: not valid TOML: {problem}") from problem

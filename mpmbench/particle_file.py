@@ -1,12 +1,14 @@
 """A user's particles in a ``.npz`` or ``.npy`` file.
 
 ``.npz``: position, velocity (n, 3) [m], [m/s]; mass (n,) or one number [kg]; optionally affine (n, 3, 3) [1/s], and the
-grid: grid_shape (or grid) as one number or three, dx [m], origin [m]. Other arrays are ignored.
+grid: grid_shape (or grid) as one number or three, dx [m], origin [m]. Other arrays are ignored, unless their name is
+nearly one of these.
 ``.npy``: (n, 7) with the columns x, y, z, vx, vy, vz, mass.
 """
 
 from __future__ import annotations
 
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -45,4 +47,10 @@ def read(path: Path) -> dict[str, Any]:
             f"file {str(path)!r} lacks {', '.join(missing)}: want arrays {', '.join(REQUIRED)} "
             f"and optionally {', '.join(OPTIONAL)}; it has {', '.join(arrays) or 'none'}"
         )
+    absent = [name for name in OPTIONAL if name not in arrays]
+    for name in arrays:
+        if name not in (*REQUIRED, *OPTIONAL, "grid") and (meant := get_close_matches(name, absent, 1, 0.8)):
+            raise InputError(
+                f"file {str(path)!r} has an array {name!r}: rename it to {meant[0]!r}, or to something else"
+            )
     return {name: arrays[name] for name in REQUIRED + OPTIONAL if name in arrays}

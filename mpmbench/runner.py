@@ -10,6 +10,7 @@ import itertools
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from traceback import extract_tb
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -316,8 +317,16 @@ def _checked(case: Case, device: Device, inputs: Inputs, about: dict[str, Any]) 
     variant, axes, dataset = case.variant, case.axes, inputs.select(case.dataset)
     dataset.check_support(axes["spline"], np.dtype(axes["dtype"]))
     nodes = inputs.rounded_nodes(axes) if variant.transfer == "g2p" else None
-    plan = planning.build_plan(variant, dataset, device, axes, nodes=nodes)
-    preprocess, transfer, finish = reports = plan.run_once(device)
+    try:
+        plan = planning.build_plan(variant, dataset, device, axes, nodes=nodes)
+        preprocess, transfer, finish = reports = plan.run_once(device)
+    except InputError:
+        raise
+    except Exception as error:  # a bug in a module that may be a user's costs its row, not the run
+        line = next((f for f in reversed(extract_tb(error.__traceback__)) if f.filename == str(variant.path)), None)
+        if line is None:
+            raise
+        raise InputError(f"{line.filename}:{line.lineno}: {type(error).__name__}: {error}") from error
     check = check_outputs(plan.outputs(), variant.transfer, inputs, axes)
     findings = [f for report in (*preprocess.values(), transfer, *finish.values()) for f in report.findings]
     about |= {"check": Check.of(check), "findings": tuple(findings)}

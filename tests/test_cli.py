@@ -233,6 +233,20 @@ def test_a_wrong_result_is_exit_code_4(tmp_path, command):
     assert "1 rows: 1 wrong" in out
 
 
+@pytest.mark.parametrize("option", ["--json", "--html", "--md", "--csv"])
+def test_outputs_replace_no_particles_and_no_sources(tmp_path, option):
+    for name in ("mine.npz", "mine.py", "mine.cu"):
+        path = tmp_path / name
+        path.write_text("mine")
+        assert "name another file to write to" in refusal("run", *SMALL, option, str(path))
+        assert path.read_text() == "mine"
+
+
+def test_an_output_that_cannot_be_written_is_refused_before_the_run():
+    said = refusal("run", *SMALL, "--html", "/proc/none/report.html")
+    assert said.startswith("mpmbench: /proc/none/report.html cannot be written: /proc: ")
+
+
 # --- interruption -----------------------------------------------------------------------------------------------------
 
 

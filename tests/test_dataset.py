@@ -393,6 +393,9 @@ def test_bad_files(tmp_path):
     for name, content in (("text.npz", b"x,y,z\n1,2,3\n"), ("empty.npy", b""), ("cut.npy", b"\x93NUMPY\x01\x00v\x00{")):
         (tmp_path / name).write_bytes(content)
         refused(tmp_path / name, f"{name}' is not a readable .np. of plain numbers")
+    close = {name: value for name, value in arrays(10).items() if name != "affine"}
+    np.savez(tmp_path / "close.npz", affin=np.zeros((10, 3, 3)), **close)
+    refused(tmp_path / "close.npz", "has an array 'affin': rename it to 'affine'")
     np.savez(tmp_path / "whole.npz", **arrays(1000))
     whole = (tmp_path / "whole.npz").read_bytes()
     (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])

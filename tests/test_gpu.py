@@ -177,6 +177,26 @@ def test_refusals(tmp_path):
         get_gpu(mine)
 
 
+@pytest.mark.parametrize(
+    ("value", "says"),
+    [
+        ("-3", "'sm_count' is -3"),
+        ("0", "'sm_count' is 0"),
+        ("nan", "'sm_count' is nan"),
+        ("'x'", "'sm_count' is no number"),
+    ],
+)
+def test_a_constant_is_a_number_above_zero(tmp_path, value, says):
+    text = Path(mpmbench.gpu.__file__).with_name("v100.toml").read_text()
+    mine = tmp_path / "mine.toml"
+    mine.write_text(text.replace("sm_count = { value = 80", f"sm_count = {{ value = {value}"))
+    with pytest.raises(InputError, match=says):
+        get_gpu(mine)
+    mine.write_text(text.replace("sm_count = { value = 80", "sm_count = 80 #"))
+    with pytest.raises(InputError, match="'sm_count' must be"):
+        get_gpu(mine)
+
+
 def test_a_description_of_ones_own_works_by_path(tmp_path):
     shipped = Path(mpmbench.gpu.__file__).with_name("v100.toml").read_text()
     mine = tmp_path / "mine.toml"

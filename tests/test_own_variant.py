@@ -118,3 +118,16 @@ def test_broken_kernel_is_one_row_with_the_compilers_words(folder) -> None:
     assert result.exit_code == 1
     assert "p2g_backwards.cu" in result.output
     assert "Traceback" not in result.output
+
+
+def test_a_bug_in_the_module_costs_its_row_and_names_its_line(folder) -> None:
+    module = folder / "p2g_backwards.py"
+    module.write_text(module.read_text().replace("work.order,", "work.ordr,"))
+    rows = folder / "rows.jsonl"
+    words = ["run", "--variants", str(folder), "-b", "p2g_*s", "-b", "p2g_global_atomic", *SMALL, "--json", str(rows)]
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 1
+    found = {r.variant: r for r in read_records(rows)}
+    assert found["p2g_global_atomic"].status == "ok"
+    assert "p2g_backwards.py:" in found["p2g_backwards"].failed_because
+    assert "'ordr'" in found["p2g_backwards"].failed_because

@@ -6,6 +6,7 @@ machine instructions that one SM starts per cycle, in whole warps.
 
 from __future__ import annotations
 
+import math
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +15,13 @@ from typing import Any
 from mpmbench.errors import InputError
 
 CONFIDENCES = ("high", "medium", "low")
+MAY_BE_ZERO = (
+    "shared_reserved_bytes_per_block",
+    "l1_holds_plain_loads",
+    "barrier_latency",
+    "block_start_cycles",
+    "launch_overhead",
+)
 
 MEANINGS: dict[str, str] = {
     "sm_count": "streaming multiprocessors (SMs) of the GPU",
@@ -126,18 +134,18 @@ def read_gpu(path: Path) -> Gpu:
     try:
         with path.open("rb") as file:
             content = tomllib.load(file)
-        constants = {name: _constant(entry) for name, entry in content["constants"].items()}
+        constants = {name: _constant(name, entry) for name, entry in content["constants"].items()}
         gpu = Gpu(path.stem, str(content["name"]), str(content["arch"]), constants)
     except OSError as error:
         raise InputError(f"cannot read GPU description {path}: {(error.strerror or str(error)).lower()}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(
-            f"{path} is no GPU description ({type(error).__name__}: {error}): take mpmbench/gpu/h100.toml as a pattern"
+            f"{path} is no GPU description ({_why(error)}): take {Path(__file__).with_name('h100.toml')} as a pattern"
         ) from None
     calibrated = CALIBRATED / path.name
     if path.parent == Path(__file__).parent and calibrated.is_file():
         with calibrated.open("rb") as file:
-            constants |= {name: _constant(entry) for name, entry in tomllib.load(file)["constants"].items()}
+            constants |= {name: _constant(name, entry) for name, entry in tomllib.load(file)["constants"].items()}
     if missing := [name for name in REQUIRED if name not in constants]:
         raise InputError(f"{path}: constant {missing[0]!r} is missing ({MEANINGS[missing[0]]})")
     if unknown := [name for name in constants if name not in MEANINGS]:
@@ -145,10 +153,21 @@ def read_gpu(path: Path) -> Gpu:
     return gpu
 
 
-def _constant(entry: Any) -> Constant:
-    constant = Constant(float(entry["value"]), str(entry["source"]), str(entry["confidence"]))
+def _why(error: Exception) -> str:
+    return f"it lacks {error}" if isinstance(error, KeyError) else str(error)
+
+
+def _constant(name: str, entry: Any) -> Constant:
+    if not isinstance(entry, dict) or not {"value", "source", "confidence"} <= set(entry):
+        raise ValueError(f"constant {name!r} must be {{ value = ..., source = ..., confidence = ... }}")
+    value = entry["value"]
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"the value of constant {name!r} is no number: {value!r}")
+    constant = Constant(float(value), str(entry["source"]), str(entry["confidence"]))
+    if not math.isfinite(constant.value) or constant.value < 0 or (constant.value == 0 and name not in MAY_BE_ZERO):
+        raise ValueError(f"constant {name!r} is {value}: want a number above zero")
     if constant.confidence not in CONFIDENCES:
-        raise ValueError(f"confidence {constant.confidence!r} is none of {', '.join(CONFIDENCES)}")
+        raise ValueError(f"confidence {constant.confidence!r} of {name!r} is none of {', '.join(CONFIDENCES)}")
     if not constant.source:
-        raise ValueError("a constant without a source")
+        raise ValueError(f"constant {name!r} is without a source")
     return constant

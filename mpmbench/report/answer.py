@@ -100,6 +100,8 @@ def _gain(g: Group, best: Record) -> str:
 def _nothing_gained(g: Group, base: Record) -> str:
     """The baseline is not beaten."""
     others = [r for r in g.leaders if r is not base]
+    if not others and len(g.ranked) == 1:
+        return f"{_over(base)} ran alone: there is nothing to compare it with"
     if not others:
         return f"use {_over(base)}: nothing is faster"
     best = others[0]

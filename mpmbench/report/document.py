@@ -261,7 +261,7 @@ def _answer(groups: Sequence[Group], on_gpus: Sequence[GpuGroup], kinds: set[Kin
     if len(transfers) > NAMED:
         sentences.append(f"The table below has {_plural(len(transfers) - NAMED, 'more modelled case')}.")
     for transfer in ("p2g", "g2p"):
-        counted = [g for g in groups if g.simulated and g.ranked and g.first.transfer == transfer]
+        counted = [g for g in groups if g.simulated and len(g.ranked) > 1 and g.first.transfer == transfer]
         for name, counter in (("sectors", tables.sectors), ("warp instructions", tables.warp_inst)):
             winners: dict[str, int] = {}
             for g in counted:
