@@ -57,8 +57,8 @@ class _Group(click.Group):
             notes.print("mpmbench: out of memory: take fewer particles (--particles) or a smaller grid", soft_wrap=True)
             ctx.exit(1)
         except KeyboardInterrupt:
-            given = ctx.meta["given"]
-            kept = given[0] == "run" and any(word.split("=")[0] == "--json" for word in given)
+            journal = any(word.split("=")[0] == "--json" for word in ctx.meta["given"])
+            kept = journal and ctx.invoked_subcommand == "run"
             more = "; what is in --json FILE is whole, run --resume goes on from there" if kept else ""
             notes.print(f"mpmbench: interrupted{more}", soft_wrap=True)
             ctx.exit(INTERRUPTED)
